@@ -1,0 +1,246 @@
+"""The command line: one command a job. Errors are one line on stderr with exit code 2; ``--debug`` shows the traceback."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from .types import Scene
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__)
+
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+@contextmanager
+def _one_line_errors(debug: bool) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise typer.Exit(130) from None
+    except (OSError, ValueError, RuntimeError, MemoryError) as error:
+        if debug:
+            raise
+        print(f"mvcore: {' '.join(str(error).split())}", file=sys.stderr)
+        raise typer.Exit(2) from None
+
+
+class _Bars:
+    """rich's progress bars as a `Track`."""
+
+    def __call__(self, items: Iterable[Any], description: str, total: int | None = None) -> Iterable[Any]:
+        from rich.console import Console
+        from rich.progress import track
+
+        return track(items, description, total, console=Console(stderr=True))
+
+
+def _numbers(name: str, text: str | None, count: int | None = None, kind: type = float) -> list[Any] | None:
+    if text is None:
+        return None
+    try:
+        values = [kind(word) for word in text.split(",") if word.strip()]
+    except ValueError:
+        raise ValueError(f"{name}: expected numbers separated by commas, got {text!r}") from None
+    if count is not None and len(values) != count:
+        raise ValueError(f"{name}: expected {count} numbers, got {len(values)}")
+    return values
+
+
+def _without(scene: Scene, excluded: list[int] | None) -> tuple[list[Any], list[Any], list[int]]:
+    excluded = excluded or []
+    wrong = [n for n in excluded if not 0 <= n < len(scene)]
+    if wrong:
+        raise ValueError(f"--exclude: expected views 0 to {len(scene) - 1}, got {wrong[0]}")
+    kept = [n for n in range(len(scene)) if n not in set(excluded)]
+    return [scene.frames[n] for n in kept], [scene.calib[n] for n in kept], kept
+
+
+@app.command()
+def reconstruct(
+    path: Annotated[Path, typer.Argument(help="A folder or calibration file; the format is found by itself.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Mesh to write: .glb, .obj or .ply.")],
+    exclude: Annotated[str | None, typer.Option(help="Views to leave out, e.g. 4,9.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks, bright on the target.")] = None,
+    bounds: Annotated[str | None, typer.Option(help="Box of the target: x0,y0,z0,x1,y1,z1.")] = None,
+    max_image_size: Annotated[int | None, typer.Option(help="Reduce images to this many pixels on the longer side.")] = None,
+    max_faces: Annotated[int | None, typer.Option(help="Decimate the mesh to this many faces.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write figures and warnings as JSON.")] = None,
+    save_depth: Annotated[Path | None, typer.Option(help="Folder for the depth maps.")] = None,
+    matcher: Annotated[str, typer.Option(help="Depth matcher: sgm.")] = "sgm",
+    debug: Debug = False,
+) -> None:
+    """Calibrated photographs in, a textured mesh out."""
+    with _one_line_errors(debug):
+        from . import pipeline
+        from .io import load
+        from .io.images import find_masks
+        from .result import FORMATS
+
+        if output.suffix.lower() not in FORMATS:
+            raise ValueError(f"--output: expected a name ending in {', '.join(FORMATS)}, got {str(output)!r}")
+        if max_image_size is not None and max_image_size < 16:
+            raise ValueError(f"--max-image-size: expected at least 16, got {max_image_size}")
+        scene = load(path)
+        frames, cameras, kept = _without(scene, _numbers("--exclude", exclude, kind=int))
+        box = _numbers("--bounds", bounds, 6)
+        settings: dict[str, Any] = {"matcher": matcher}
+        if max_image_size is not None:
+            settings["depth"] = {"max_image_size": max_image_size}
+        if max_faces is not None:
+            settings["surface"] = {"max_faces": max_faces}
+        given = find_masks(masks, frames) if masks is not None else None
+        if given is None and scene.masks is not None:
+            print("masks lie beside the images; pass --masks to use them", file=sys.stderr)
+        result = pipeline.reconstruct(
+            frames, cameras, masks=given, bounds=box if box is not None else scene.bounds, config=settings, track=_Bars()
+        )
+        result.report |= {"input": str(path), "format": scene.format, "view_numbers": kept}
+        result.save(output)
+        if save_depth is not None:
+            result.save_depth(save_depth)
+        if report is not None:
+            result.save_report(report)
+        for warning in result.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
+        seconds = result.report["seconds"].values()
+        cpu, wall = sum(s["cpu"] for s in seconds), sum(s["wall"] for s in seconds)
+        print(f"{output}: {len(result.faces)} faces from {len(frames)} views, {wall:.0f} s ({cpu:.0f} CPU seconds)")
+
+
+@app.command()
+def disparity(
+    left: Annotated[Path, typer.Argument(help="Left image of a rectified pair.")],
+    right: Annotated[Path, typer.Argument(help="Right image.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Disparity map to write: .pfm, or .png (a picture).")],
+    max_disparity: Annotated[int, typer.Option(help="Largest disparity in pixels.")],
+    min_disparity: Annotated[int, typer.Option(help="Smallest disparity in pixels.")] = 0,
+    debug: Debug = False,
+) -> None:
+    """Disparity of the left image of a rectified pair."""
+    with _one_line_errors(debug):
+        from . import _core
+        from .depth import disparity as match
+        from .io.images import read_image
+        from .io.maps import colourise, write_pfm
+        from .io.write import atomically
+
+        if output.suffix not in (".pfm", ".png"):
+            raise ValueError(f"--output: expected a name ending in .pfm or .png, got {str(output)!r}")
+        found, _ = match(read_image(left), read_image(right), max_disparity=max_disparity, min_disparity=min_disparity)
+        if output.suffix == ".pfm":
+            write_pfm(output, found)
+        else:
+            picture = _core.encode_png(colourise(1 / found.clip(1e-3)))
+            atomically(output, lambda p: p.write_bytes(picture) and None)
+        print(f"{output}: {found.shape[1]} x {found.shape[0]}, median {float(sorted(found.ravel())[found.size // 2]):.2f} px")
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(help="A folder or calibration file.")],
+    debug: Debug = False,
+) -> None:
+    """What was read, and how well the calibration fits the images."""
+    with _one_line_errors(debug):
+        from .errors import ReconstructionError
+        from .io import load
+        from .io.images import load_frame, undistort
+        from .sparse import find_points, target_box
+        from .types import Report
+
+        scene = load(path)
+        sizes = sorted({(c.width, c.height) for c in scene.calib})
+        print(f"{path}: {scene.format}, {len(scene)} views of {', '.join(f'{w} x {h}' for w, h in sizes)}")
+        print(f"distortion: {'yes' if any(c.distortion.size for c in scene.calib) else 'no'}; masks: {'yes' if scene.masks else 'no'}")
+        scene.calib.check_baselines()
+        report = Report()
+        images = [undistort(load_frame(f, c, n), c) for n, (f, c) in enumerate(zip(scene.frames, scene.calib, strict=True))]
+        cameras = [c.pinhole() for c in scene.calib]
+        try:
+            points = find_points(images, cameras, report=report, track=_Bars())
+        except ReconstructionError as error:
+            print(f"calibration: {error}")
+            raise typer.Exit(1) from None
+        error_px = report.values["calibration"]["median_epipolar_error_px"]
+        shown = "unknown (too few matches)" if error_px is None else f"median epipolar error {error_px:.2f} px"
+        print(f"calibration: {shown}; {len(points)} sparse points")
+        box = scene.bounds if scene.bounds is not None else target_box(cameras, points)
+        print(f"target box: {box.round(4).tolist()}{' (given)' if scene.bounds is not None else ''}")
+        for warning in report.warnings:
+            print(f"warning: {warning}")
+
+
+@app.command()
+def convert(
+    path: Annotated[Path, typer.Argument(help="A folder or calibration file of any known format.")],
+    output: Annotated[Path, typer.Argument(help="cameras.json, or a folder for COLMAP or MVSNet files.")],
+    to: Annotated[str | None, typer.Option(help="mvcore, colmap or mvsnet; by default mvcore for .json, else colmap.")] = None,
+    debug: Debug = False,
+) -> None:
+    """Calibrations from one format to another."""
+    with _one_line_errors(debug):
+        from .io import load, save_calibration
+
+        format = to or ("mvcore" if output.suffix == ".json" else "colmap")
+        scene = load(path, images=False)
+        save_calibration(output, scene, format)
+        print(f"{output}: {len(scene)} views as {format}")
+
+
+@app.command(name="eval")
+def evaluate(
+    result: Annotated[Path, typer.Argument(help="Mesh or points to judge.")],
+    truth: Annotated[Path, typer.Argument(help="True mesh or points.")],
+    thresholds: Annotated[str, typer.Option(help="Distances for the F-score, world units.")],
+    visible: Annotated[Path | None, typer.Option(help="Points of the truth that the views see.")] = None,
+    samples: Annotated[int, typer.Option(help="Samples of each surface.")] = 1_000_000,
+    debug: Debug = False,
+) -> None:
+    """Accuracy, completeness, overall and F-score of a mesh, as JSON."""
+    with _one_line_errors(debug):
+        from .metrics import load_geometry, mesh_metrics
+
+        seen = load_geometry(visible)[0] if visible is not None else None
+        found = mesh_metrics(
+            load_geometry(result),
+            load_geometry(truth),
+            _numbers("--thresholds", thresholds) or [],
+            visible=seen,
+            samples=samples,
+        )
+        print(json.dumps(found, indent=1))
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the result.")] = Path("out"),
+    debug: Debug = False,
+) -> None:
+    """Reconstruct the bundled sample: a pickup in a yard, 16 views."""
+    with _one_line_errors(debug):
+        sample = Path(__file__).parent / "sample"
+        if not (sample / "cameras.json").is_file():
+            raise FileNotFoundError(f"{sample}: the bundled sample is not installed")
+        reconstruct(sample, output / "pickup.glb", masks=sample / "masks", report=output / "report.json", save_depth=output / "depth")
+
+
+def main() -> None:
+    """Entry point; Ctrl-C ends quietly."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Settings: one frozen dataclass a stage, each field with its unit and its reason."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from .errors import InvalidInputError, require
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SparseConfig:
+    """Feature points: depth ranges, view scores and the health of the calibration."""
+
+    max_features: int = 4000
+    """SIFT features a view: enough for ranges and scores; matching grows with the square."""
+    neighbours: int = 8
+    """Views that each view is matched with, nearest in position and direction first."""
+    ratio: float = 0.8
+    """Lowe's ratio test along the epipolar line."""
+    band: float = 2.0
+    """Pixels: half width of the epipolar band, widened where the calibration is found to be worse."""
+    min_parallax: float = 3.0
+    """Degrees: a point seen under less has no reliable depth."""
+    max_error: float = 2.0
+    """Pixels of reprojection error above which a point is dropped."""
+    warn_error: float = 1.0
+    """Pixels of median epipolar error above which the calibration is called doubtful."""
+    fail_error: float = 5.0
+    """Pixels of median epipolar error above which reconstruction is refused."""
+    range_stretch: float = 0.25
+    """Share by which a view's 1 % .. 99 % depth range is stretched at either end."""
+
+
+@dataclass(frozen=True)
+class DepthConfig:
+    """Depth maps by plane sweep, semi-global aggregation and slanted refinement."""
+
+    sources: int = 6
+    """Source views a reference view: the paper's figure; the best half is used at each pixel."""
+    best_angle: float = 5.0
+    """Degrees between views that match best: less has no parallax, more looks different."""
+    max_angle: float = 65.0
+    """Degrees beyond which two views do not show the same surface."""
+    planes: int = 128
+    """Planes of the sweep, uniform in inverse depth: the paper's figure."""
+    coarsest: int = 200
+    """Pixels: the sweep runs where the longer side is about this long; below, windows see too little."""
+    p1: int = 6
+    """Aggregation penalty of a step by one plane, cost units (0 .. 64)."""
+    p2: int = 60
+    """Aggregation penalty of a larger step on an even surface, cost units."""
+    p2_falloff: int = 12
+    """Grey levels of an image edge at which `p2` has halved."""
+    sweep_rounds: int = 3
+    """Rounds of slanted refinement at the sweep's scale, where they are cheap."""
+    rounds: int = 2
+    """Rounds at each finer scale."""
+    max_slant: float = 76.0
+    """Degrees between a surface's normal and the view: flatter surfaces cannot be matched."""
+    prior_weight: float = 0.1
+    """Pull towards the semi-global solution, in units of 1 - ZNCC: decides only where the photographs do not."""
+    prior_reach: float = 4.0
+    """Planes at which that pull stops growing."""
+    max_image_size: int = 1600
+    """Pixels: longer sides are reduced to this; detail beyond costs time and rarely adds shape."""
+    geometry_weight: float = 0.2
+    """Cost of missing the other views' surfaces by three pixels or more, in units of 1 - ZNCC (ACMM's value)."""
+    geometry_rounds: int = 2
+    """Rounds at half the size once the other views' depth is known."""
+    min_views: int = 1
+    """Fewest other views that must agree with a depth, at the tightest tolerance."""
+    pixel_unit: float = 0.5
+    """Pixels of reprojection error allowed per agreeing view."""
+    depth_unit: float = 1.0 / 600.0
+    """Relative depth error allowed per agreeing view."""
+    max_cost: float = 0.8
+    """1 - ZNCC above which a depth is dropped: unrelated patches have about 1."""
+
+
+@dataclass(frozen=True)
+class VolumeConfig:
+    """Fusion of the depth maps into a block-sparse signed distance field."""
+
+    voxel: float | None = None
+    """World units; by default `footprints` pixel footprints of the target."""
+    footprints: float = 1.25
+    """Pixel footprints a voxel: below 1 there is nothing to resolve, above 1.5 detail is lost."""
+    truncation: float = 4.0
+    """Voxels on either side of a surface that carry its distance."""
+    free_weight: float = 0.3
+    """Weight of seeing through a voxel against seeing a surface there."""
+    min_weight: float = 0.05
+    """Weight below which a voxel counts as never seen; 1 is a confident depth at the target's distance."""
+    hull_tolerance: float = 0.05
+    """Share of the silhouettes that may disagree: one wrong mask among many does no harm."""
+    max_memory: int = 4 << 30
+    """Bytes of the volume; the voxels grow until it fits, and the report says so."""
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """From the field to the mesh."""
+
+    min_component: float = 0.005
+    """Parts with a smaller share of the faces than this, relative to the largest, are dropped."""
+    smooth: int = 0
+    """Rounds of Taubin smoothing: rounds off noise without shrinking."""
+    max_faces: int | None = None
+    """Faces to decimate to by quadric errors; None keeps all."""
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Photographs onto the mesh."""
+
+    seam: float = 0.5
+    """Cost of a seam along one edge against the best and the worst view of a face (1)."""
+    outlier: float = 60.0
+    """Grey levels by which a view may differ from the median of all: beyond, it shows an occluder or a highlight."""
+    least_patch: int = 32
+    """Faces below which a patch takes its neighbour's view."""
+    mask_erosion: int = 3
+    """Pixels taken off the masks: their borders mix in background."""
+    max_size: int = 8192
+    """Texels a side of the atlas; photographs are reduced until it fits."""
+    padding_depth: float = 2.0
+    """Voxels by which a vertex may lie behind the z-buffer and still count as seen."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that can be set.
+
+    Examples
+    --------
+    >>> Config.from_dict({"volume": {"footprints": 1.5}}).volume.footprints
+    1.5
+    """
+
+    sparse: SparseConfig = field(default_factory=SparseConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    texture: TextureConfig = field(default_factory=TextureConfig)
+    matcher: str = "sgm"
+    """The depth matcher; ``sgm`` is the classical one."""
+
+    def __post_init__(self) -> None:
+        require(self.matcher in MATCHERS, "matcher", f"one of {', '.join(MATCHERS)}", repr(self.matcher))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Config:
+        """From nested mappings; unknown keys are refused with the nearest known one."""
+        return _build(cls, values, "config")
+
+
+MATCHERS = ("sgm",)
+
+
+def _build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
+    require(isinstance(values, Mapping), where, "a mapping", repr(values))
+    known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    arguments = {}
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1)
+            hint = f"; did you mean {near[0]!r}?" if near else f"; known are {', '.join(known)}"
+            raise InvalidInputError(f"{where}: unknown key {key!r}{hint}")
+        part = known[key].default_factory
+        nested = part if dataclasses.is_dataclass(part) else None
+        arguments[key] = _build(nested, value, f"{where}.{key}") if nested else value
+    return cls(**arguments)

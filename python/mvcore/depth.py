@@ -1,0 +1,344 @@
+"""Depth maps: plane sweep, semi-global aggregation, slanted refinement, and consistency across views.
+
+The classical matcher. Coarse to fine: the sweep and the aggregation run on a small image, where they see the most context;
+planes are then refined on it and on each finer scale up to the full size. A rectified pair is the same code with horizontal
+homographies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core
+from .cameras import Camera, relative_map
+from .config import DepthConfig
+from .errors import require
+from .types import DepthMap
+
+Grey = NDArray[np.uint8]
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class View:
+    """An undistorted grey image, (h, w) uint8, with its camera."""
+
+    grey: Grey
+    camera: Camera
+
+    def at(self, width: int, height: int) -> View:
+        """The view reduced to another size."""
+        if self.grey.shape == (height, width):
+            return self
+        grey = cv2.resize(self.grey, (width, height), interpolation=cv2.INTER_AREA)
+        return View(grey, self.camera.resized(width, height))
+
+
+def _scales(width: int, height: int, coarsest: int) -> list[tuple[int, int]]:
+    """Sizes from the coarsest to the full one, each half of the next."""
+    sizes = [(width, height)]
+    while max(sizes[0]) >= 1.5 * coarsest:
+        w, h = sizes[0]
+        sizes.insert(0, ((w + 1) // 2, (h + 1) // 2))
+    return sizes
+
+
+def _slopes(inverse: Map) -> tuple[Map, Map]:
+    """Slopes per pixel of a map from its 5x5 surroundings, after a median that keeps edges."""
+    smooth = cv2.medianBlur(inverse, 5)
+    scale = 1.0 / 128.0  # sum of the Sobel kernel's weights times their distances
+    return (
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=5, scale=scale, borderType=cv2.BORDER_REPLICATE),
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=5, scale=scale, borderType=cv2.BORDER_REPLICATE),
+    )
+
+
+def _upsample(planes: Map, width: int, height: int) -> Map:
+    """Planes (h, w, 4) on a finer grid: each pixel takes the nearest plane, continued to its own place."""
+    h, w = planes.shape[:2]
+    x, y = (np.arange(width) + 0.5) * w / width - 0.5, (np.arange(height) + 0.5) * h / height - 0.5
+    i, j = np.clip(np.rint(x).astype(int), 0, w - 1), np.clip(np.rint(y).astype(int), 0, h - 1)
+    fine = planes[j][:, i]
+    fine[..., 0] += fine[..., 1] * (x - i)[None] + fine[..., 2] * (y - j)[:, None]
+    fine[..., 1] *= w / width
+    fine[..., 2] *= h / height
+    return np.ascontiguousarray(fine, np.float32)
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """One size of the problem: images (reference first), relative maps there (S, 12) and back, the slope limit."""
+
+    greys: list[Grey]
+    there: Map
+    back: Map
+    max_slope: float
+
+
+NO_DEPTHS: list[Map] = []
+NO_BACKS = np.zeros((0, 12), np.float32)
+
+
+def _refine(
+    scale: _Scale,
+    planes: Map,
+    prior: Map,
+    span: tuple[float, float],
+    step: float,
+    rounds: int,
+    config: DepthConfig,
+    reach: float,
+    depths: list[Map] = NO_DEPTHS,
+) -> Map:
+    return _core.refine(
+        scale.greys[0],
+        scale.greys[1:],
+        scale.there,
+        depths,
+        scale.back if depths else NO_BACKS,
+        planes,
+        prior,
+        iterations=rounds,
+        low=span[0],
+        high=span[1],
+        step=step,
+        max_slope=scale.max_slope,
+        prior_weight=config.prior_weight,
+        prior_reach=reach,
+        geometry_weight=config.geometry_weight,
+    )
+
+
+@dataclass(frozen=True)
+class _Hypotheses:
+    """Inverse-depth planes (h, w, 4) on one scale, with the semi-global solution and its margin on the coarsest."""
+
+    planes: Map
+    prior: Map
+    margin: Map
+    span: tuple[float, float]
+    step: float
+
+
+def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig) -> _Hypotheses:
+    """Sweep, aggregate, refine at one scale."""
+    inverse = np.linspace(low, high, planes, dtype=np.float32)
+    step = float(inverse[1] - inverse[0])
+    costs = _core.sweep(scale.greys[0], scale.greys[1:], scale.there, inverse)
+    index, margin = _core.aggregate(costs, scale.greys[0], config.p1, config.p2, config.p2_falloff)
+    del costs
+    prior = (low + index * step).astype(np.float32)
+    a, b = _slopes(prior)
+    start = np.stack([prior, a, b, np.zeros_like(a)], -1)
+    refined = _refine(scale, start, prior, (low, high), step, config.sweep_rounds, config, config.prior_reach)
+    return _Hypotheses(refined, prior, margin, (low, high), step)
+
+
+def _finer(coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig, depths: list[Map] = NO_DEPTHS) -> _Hypotheses:
+    """The hypotheses on a finer (or the same) scale, refined there."""
+    h, w = scale.greys[0].shape
+    planes = coarse.planes if coarse.planes.shape[:2] == (h, w) else _upsample(coarse.planes, w, h)
+    prior = cv2.resize(coarse.prior, (w, h), interpolation=cv2.INTER_LINEAR)
+    # One pixel of parallax is half as much inverse depth on an image twice as large.
+    ratio = coarse.prior.shape[1] / w
+    planes = _refine(
+        scale, planes, prior, coarse.span, coarse.step * ratio, rounds, config, config.prior_reach / ratio, depths
+    )
+    return replace(coarse, planes=planes)
+
+
+def _pyramid(reference: View, sources: Sequence[View], config: DepthConfig) -> list[_Scale]:
+    scales = []
+    for w, h in _scales(reference.camera.width, reference.camera.height, config.coarsest):
+        share = w / reference.camera.width
+        mine = reference.at(w, h)
+        theirs = [
+            s.at(max(2, round(s.camera.width * share)), max(2, round(s.camera.height * share))) for s in sources
+        ]
+        there = np.stack([relative_map(mine.camera, s.camera) for s in theirs])
+        back = np.stack([relative_map(s.camera, mine.camera) for s in theirs])
+        slope = float(np.tan(np.radians(config.max_slant)) / mine.camera.K[0, 0])
+        scales.append(_Scale([mine.grey, *(s.grey for s in theirs)], there, back, slope))
+    return scales
+
+
+def _check(sources: Sequence[View], near: float, far: float) -> None:
+    require(len(sources) >= 1, "sources", "at least one view", "none")
+    require(0 < near < far < np.inf, "near, far", "0 < near < far", f"{near:g}, {far:g}")
+
+
+@dataclass(frozen=True)
+class RoughDepth:
+    """A view's depth from photographs alone, at half the size: what `refine_depth` starts from."""
+
+    hypotheses: _Hypotheses
+
+    @property
+    def depth(self) -> Map:
+        """z-depth, (h, w) float32, 0 = none."""
+        inverse = self.hypotheses.planes[..., 0]
+        return np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
+
+
+def sweep_depth(
+    reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None
+) -> RoughDepth:
+    """First pass: sweep, aggregation and refinement up to half the size.
+
+    Parameters
+    ----------
+    reference, sources : undistorted views; one source or more.
+    near, far : z-depths in world units between which the surface lies.
+
+    Raises
+    ------
+    InvalidInputError
+        No sources, or a range that is empty.
+    """
+    config = config or DepthConfig()
+    _check(sources, near, far)
+    coarsest, *finer = _pyramid(reference, sources, config)
+    found = _sweep(coarsest, 1 / far, 1 / near, config.planes, config)
+    for scale in finer[:-1]:
+        found = _finer(found, scale, config.rounds, config)
+    return RoughDepth(found)
+
+
+def refine_depth(
+    reference: View,
+    sources: Sequence[View],
+    rough: RoughDepth,
+    rough_sources: Sequence[RoughDepth],
+    config: DepthConfig | None = None,
+) -> DepthMap:
+    """Second pass: the planes are refined further, up to full size, with the sources' own depth as a witness."""
+    config = config or DepthConfig()
+    found = rough.hypotheses
+    scales = _pyramid(reference, sources, config)[-2:]
+    for n, scale in enumerate(scales):
+        depths = [_resized(r.depth, grey.shape) for r, grey in zip(rough_sources, scale.greys[1:], strict=True)]
+        found = _finer(found, scale, config.rounds if n == len(scales) - 1 else config.geometry_rounds, config, depths)
+    h, w = found.planes.shape[:2]
+    return _depth_map(found.planes, cv2.resize(found.margin, (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def _resized(depth: Map, shape: tuple[int, ...]) -> Map:
+    h, w = shape
+    return depth if depth.shape == (h, w) else cv2.resize(depth, (w, h), interpolation=cv2.INTER_NEAREST)
+
+
+def _depth_map(planes: Map, margin: Map) -> DepthMap:
+    inverse, cost = planes[..., 0], planes[..., 3]
+    depth = np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
+    # ZNCC as likelihood, lifted where the aggregation found a clear winner.
+    confidence = np.clip(1.0 - cost, 0.02, 1.0) * (0.5 + 0.5 * np.clip(4 * margin, 0, 1))
+    return DepthMap(depth, confidence.astype(np.float32))
+
+
+def filter_depth(
+    index: int, depths: Sequence[DepthMap], cameras: Sequence[Camera], others: Sequence[int], config: DepthConfig | None = None
+) -> tuple[DepthMap, NDArray[np.uint8]]:
+    """Depth of view ``index`` that other views agree with, and by how many: the dynamic rule of D2HC-RMVSNet."""
+    config = config or DepthConfig()
+    mine, camera = depths[index], cameras[index]
+    sure = np.where(mine.confidence > (1 - config.max_cost) * 0.5, mine.depth, np.float32(0))
+    others = list(others)[:32]
+    there = np.array([relative_map(camera, cameras[j]) for j in others], np.float32).reshape(-1, 12)
+    back = np.array([relative_map(cameras[j], camera) for j in others], np.float32).reshape(-1, 12)
+    kept, support = _core.consistency(
+        np.ascontiguousarray(sure),
+        [depths[j].depth for j in others],
+        there,
+        back,
+        min(config.min_views, max(1, len(others))),
+        config.pixel_unit,
+        config.depth_unit,
+    )
+    return DepthMap(kept, np.where(kept > 0, mine.confidence, 0).astype(np.float32)), support
+
+
+def disparity(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    *,
+    max_disparity: int,
+    min_disparity: int = 0,
+    config: DepthConfig | None = None,
+    fill: bool = True,
+) -> tuple[Map, Map]:
+    """Disparity of the left image of a rectified pair.
+
+    Parameters
+    ----------
+    left, right : (h, w) or (h, w, 3) uint8, the same size.
+    max_disparity, min_disparity : pixels; a point at column x of the left image stands at x - d of the right one.
+    fill : replace what the right image does not confirm by the surrounding background; otherwise it is 0.
+
+    Returns
+    -------
+    disparity, confidence : (h, w) float32, pixels and 0 .. 1.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> right = rng.integers(0, 255, (60, 120), np.uint8)
+    >>> left = np.roll(right, 7, axis=1)
+    >>> d, _ = disparity(left, right, max_disparity=16)
+    >>> bool(abs(np.median(d[:, 30:]) - 7) < 0.1)
+    True
+    """
+    config = config or DepthConfig()
+    images = [_grey("left", left), _grey("right", right)]
+    require(images[0].shape == images[1].shape, "right", f"the size of left {images[0].shape}", images[1].shape)
+    require(max_disparity > min_disparity, "max_disparity", f"more than min_disparity ({min_disparity})", max_disparity)
+    mine = _rectified(images[0], images[1], min_disparity, max_disparity, config)
+    flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
+    theirs = _rectified(*flipped, min_disparity, max_disparity, config)
+    other = theirs[:, ::-1, 0]
+    d = mine[..., 0]
+    h, w = d.shape
+    x = np.arange(w)[None] - d
+    near = np.clip(np.rint(x).astype(int), 0, w - 1)
+    seen = (np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5)
+    cost = mine[..., 3]
+    confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
+    if not fill:
+        return np.where(seen, d, 0).astype(np.float32), confidence
+    return _fill_occlusions(d, seen, images[0]), confidence
+
+
+def _grey(name: str, image: NDArray[np.uint8]) -> Grey:
+    image = np.asarray(image)
+    require(image.dtype == np.uint8, name, "uint8 values", image.dtype)
+    require(image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3), name, "shape (h, w) or (h, w, 3)", image.shape)
+    require(min(image.shape[:2]) >= 2, name, "at least 2 x 2 pixels", image.shape)
+    return np.ascontiguousarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+RECTIFIED = np.array([[1, 0, 0, 0, 1, 0, 0, 0, 1, -1, 0, 0]], np.float32)
+"""The relative map of a rectified pair: inverse depth is disparity."""
+
+
+def _rectified(left: Grey, right: Grey, low: int, high: int, config: DepthConfig) -> Map:
+    # A pair's sweep runs at full size: its ranges are short and its details fine.
+    scale = _Scale([left, right], RECTIFIED, NO_BACKS, 1.0)
+    return _sweep(scale, float(low), float(high), high - low + 1, config).planes
+
+
+def _fill_occlusions(d: Map, seen: NDArray[np.bool_], guide: Grey) -> Map:
+    """What one image alone shows lies behind: take the lower of the nearest confirmed disparities left and right."""
+    h, w = d.shape
+    columns = np.broadcast_to(np.arange(w), (h, w))
+    left = np.maximum.accumulate(np.where(seen, columns, -1), 1)
+    right = np.minimum.accumulate(np.where(seen, columns, w)[:, ::-1], 1)[:, ::-1]
+    at_left = np.where(left >= 0, np.take_along_axis(d, left.clip(0), 1), np.inf)
+    at_right = np.where(right < w, np.take_along_axis(d, right.clip(None, w - 1), 1), np.inf)
+    lower = np.minimum(at_left, at_right)
+    filled = np.where(seen | ~np.isfinite(lower), d, lower).astype(np.float32)
+    smooth = cv2.medianBlur(filled, 5)
+    return np.where(seen, filled, smooth).astype(np.float32)

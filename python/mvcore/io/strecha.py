@@ -1,0 +1,35 @@
+"""Strecha's ``image.jpg.camera``: K, a row of zeros, R (camera to world), the camera centre, width and height."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .records import Found, Lines, Record, image_in
+
+
+def find(path: Path) -> Path | None:
+    """The folder of ``.camera`` files."""
+    if path.is_file():
+        return path.parent if path.suffix == ".camera" else None
+    return next((f for f in (path, path / "images", path / "cameras") if any(f.glob("*.camera"))), None)
+
+
+def read(folder: Path) -> Found:
+    """The views of a folder, by name."""
+    return Found([_view(folder, path) for path in sorted(folder.glob("*.camera"))], folder)
+
+
+def _view(folder: Path, path: Path) -> Record:
+    lines = Lines(path)
+    k = np.array([lines.numbers(n, 3) for n in (1, 2, 3)])
+    lines.numbers(4, 3)
+    rotation = np.array([lines.numbers(n, 3) for n in (5, 6, 7)]).T
+    center = np.array(lines.numbers(8, 3))
+    width, height = lines.numbers(9, 2)
+    name = path.name.removesuffix(".camera")
+    image = image_in(folder, name) or image_in(folder.parent, name) or folder / name
+    return Record(
+        K=k, R=rotation, t=-rotation @ center, width=int(width), height=int(height), image=image, name=name, line=1
+    )

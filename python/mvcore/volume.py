@@ -1,0 +1,133 @@
+"""Fusion of depth maps and silhouettes into a block-sparse signed distance field (paper eqs 39-41, for any pose)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core
+from .cameras import Camera
+from .config import VolumeConfig
+from .errors import ReconstructionError, require
+from .types import Bounds, DepthMap, Report
+
+SIDE = 8
+"""Voxels along a block's side."""
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A truncated signed distance field in blocks of 8 x 8 x 8 voxels.
+
+    origin : (3,) world position of sample (0, 0, 0). voxel : sample distance, world units. shape : samples along x, y, z.
+    coords : (B, 3) uint32, ascending block coordinates. values : (B, 8, 8, 8) float32, distance over truncation, negative
+    inside, NaN unobserved.
+    """
+
+    origin: NDArray[np.float64]
+    voxel: float
+    shape: tuple[int, int, int]
+    coords: NDArray[np.uint32]
+    values: NDArray[np.float32]
+
+    @property
+    def blocks(self) -> tuple[int, int, int]:
+        """Blocks along x, y, z."""
+        nx, ny, nz = (-(-n // SIDE) for n in self.shape)
+        return nx, ny, nz
+
+
+def target_voxel(cameras: Sequence[Camera], depths: Sequence[DepthMap], bounds: Bounds, config: VolumeConfig) -> float:
+    """Voxel size in world units: ``config.footprints`` median pixel footprints (depth over focal length) inside the bounds."""
+    if config.voxel is not None:
+        require(config.voxel > 0, "voxel", "a positive size", config.voxel)
+        return config.voxel
+    footprints = []
+    for camera, view in zip(cameras, depths, strict=True):
+        y, x = np.nonzero(view.depth[::4, ::4])
+        z = view.depth[::4, ::4][y, x]
+        points = camera.unproject(np.column_stack([4 * x, 4 * y]), z)
+        inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
+        footprints.append(z[inside] / camera.K[0, 0])
+    every = np.concatenate(footprints)
+    if not len(every):  # silhouettes alone: the box's middle stands for the target
+        middle = bounds.mean(0)[None]
+        every = np.array([c.to_camera(middle)[0, 2] / c.K[0, 0] for c in cameras])
+        every = every[every > 0]
+    require(len(every), "bounds", "a box in front of the cameras", bounds.tolist())
+    return config.footprints * float(np.median(every))
+
+
+def silhouette_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Signed distance to a mask's border in pixels, positive outside, (h, w) float32."""
+    inside = (mask > 0).astype(np.uint8)
+    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
+
+
+def fuse(
+    depths: Sequence[DepthMap],
+    cameras: Sequence[Camera],
+    bounds: Bounds,
+    masks: Sequence[NDArray[np.uint8]] | None = None,
+    config: VolumeConfig | None = None,
+    report: Report | None = None,
+) -> Volume:
+    """Fuse depth maps inside ``bounds``; with masks the field is carved to the visual hull and closed inside it.
+
+    Parameters
+    ----------
+    depths : one a camera, of the camera's size; weights are confidence times (target distance / z)⁴, as σz grows with z².
+    bounds : (2, 3) world.
+    masks : (h, w) uint8, non-zero on the target.
+
+    Raises
+    ------
+    ReconstructionError
+        Nothing lies inside the bounds.
+    """
+    config, report = config or VolumeConfig(), report or Report()
+    bounds = np.asarray(bounds, np.float64)
+    voxel = target_voxel(cameras, depths, bounds, config)
+    weights = [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)]
+    silhouettes = None if masks is None else [silhouette_distance(m) for m in masks]
+    wanted = voxel
+    while True:
+        origin = bounds[0] - 2 * voxel
+        nx, ny, nz = (int(n) for n in np.ceil((bounds[1] - bounds[0]) / voxel) + 5)
+        try:
+            coords, values = _core.fuse(
+                origin.tolist(),
+                voxel,
+                [nx, ny, nz],
+                [d.depth for d in depths],
+                weights,
+                silhouettes,
+                np.stack([c.projection for c in cameras]),
+                truncation=config.truncation * voxel,
+                free_weight=config.free_weight,
+                min_weight=config.min_weight,
+                hull_tolerance=config.hull_tolerance,
+                max_memory=config.max_memory,
+            )
+            break
+        except MemoryError:
+            voxel *= 1.2
+    if voxel > wanted:
+        report.warn(f"voxels grew from {wanted:.4g} to {voxel:.4g} to stay within max_memory = {config.max_memory} bytes")
+    if not len(coords):
+        raise ReconstructionError("no surface lies inside the bounds: check the bounds, the masks and the depth maps")
+    report.values["volume"] = {"voxel": voxel, "shape": [nx, ny, nz], "blocks": len(coords), "bytes": values.nbytes}
+    return Volume(origin, voxel, (nx, ny, nz), coords, values)
+
+
+def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
+    distance = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), 1e-9)
+    with np.errstate(divide="ignore"):
+        nearer = np.where(view.depth > 0, distance / np.maximum(view.depth, 1e-12), 0)
+    return (view.confidence * np.clip(nearer, 0.1, 2.0) ** 4).astype(np.float32)

@@ -1,0 +1,82 @@
+//! Between Python and the kernels: borrowed arrays, returned arrays, the one mapping of errors, the one way out of Python.
+
+use mvcore::raster::{Epipolar, Raster};
+use mvcore::{Error, Result};
+use ndarray::{Array, Dimension, IntoDimension};
+use numpy::{Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2};
+use pyo3::exceptions::{PyMemoryError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::PyAnyMethods;
+
+/// Runs a kernel without the interpreter lock and maps its error.
+pub fn run<T: Send>(py: Python<'_>, kernel: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
+    py.detach(kernel).map_err(|error| to_python(py, &error))
+}
+
+fn to_python(py: Python<'_>, error: &Error) -> PyErr {
+    let class = match error {
+        Error::InvalidInput { .. } => "InvalidInputError",
+        Error::File { .. } => "FormatError",
+        Error::OutOfMemory { .. } => return PyMemoryError::new_err(error.to_string()),
+    };
+    let raised = py.import("mvcore.errors").and_then(|m| m.getattr(class)).and_then(|c| c.call1((error.to_string(),)));
+    raised.map_or_else(|_| PyValueError::new_err(error.to_string()), PyErr::from_value)
+}
+
+/// A contiguous array's values, or an error naming the argument.
+pub fn slice<'a, T: Element, D: Dimension>(
+    array: &'a PyReadonlyArray<'_, T, D>,
+    argument: &'static str,
+) -> PyResult<&'a [T]> {
+    array.as_slice().map_err(|_| PyValueError::new_err(format!("{argument}: expected a C-contiguous array")))
+}
+
+/// A 2-D array as a raster.
+pub fn raster<'a, T: Element>(
+    array: &'a PyReadonlyArray2<'_, T>,
+    argument: &'static str,
+) -> PyResult<Raster<'a, T>> {
+    let shape = array.as_array().dim();
+    Raster::new(slice(array, argument)?, shape.1, shape.0, argument)
+        .map_err(|error| to_python(array.py(), &error))
+}
+
+/// A list of 2-D arrays as rasters.
+pub fn rasters<'a, T: Element>(
+    arrays: &'a [PyReadonlyArray2<'_, T>],
+    argument: &'static str,
+) -> PyResult<Vec<Raster<'a, T>>> {
+    arrays.iter().map(|a| raster(a, argument)).collect()
+}
+
+/// An (n, 12) array as maps between views: nine values of the matrix, three of the offset.
+pub fn map_of(maps: &PyReadonlyArray2<'_, f32>, n: usize, argument: &'static str) -> PyResult<Vec<Epipolar>> {
+    let maps = maps.as_array();
+    if maps.dim() != (n, 12) {
+        return Err(PyValueError::new_err(format!("{argument}: expected shape ({n}, 12), got {:?}", maps.dim())));
+    }
+    let map = |i: usize| Epipolar {
+        matrix: std::array::from_fn(|k| maps[(i, k)]),
+        offset: std::array::from_fn(|k| maps[(i, 9 + k)]),
+    };
+    Ok((0..n).map(map).collect())
+}
+
+/// Source images and their maps.
+pub fn sources<'a>(
+    images: &'a [PyReadonlyArray2<'_, u8>],
+    maps: &PyReadonlyArray2<'_, f32>,
+) -> PyResult<Vec<(Raster<'a, u8>, Epipolar)>> {
+    Ok(rasters(images, "images")?.into_iter().zip(map_of(maps, images.len(), "maps")?).collect())
+}
+
+/// A kernel's vector as an array of the given shape, without a copy.
+pub fn array<T: Element, D: Dimension>(
+    py: Python<'_>,
+    values: Vec<T>,
+    shape: impl IntoDimension<Dim = D>,
+) -> PyResult<Bound<'_, PyArray<T, D>>> {
+    let array = Array::from_shape_vec(shape.into_dimension(), values)
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    Ok(array.into_pyarray(py))
+}

@@ -1,0 +1,78 @@
+//! Bindings of the depth kernels.
+
+use crate::convert::{array, map_of, raster, rasters, run, slice, sources};
+use mvcore::aggregate::Penalties;
+use mvcore::slanted::{Hypothesis, RefineParams, SourceSurface};
+use numpy::{PyArray2, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+
+#[pyfunction]
+#[pyo3(signature = (reference, images, maps, planes, best = 0))]
+pub fn sweep<'py>(
+    py: Python<'py>,
+    reference: PyReadonlyArray2<'py, u8>,
+    images: Vec<PyReadonlyArray2<'py, u8>>,
+    maps: PyReadonlyArray2<'py, f32>,
+    planes: PyReadonlyArray1<'py, f32>,
+    best: usize,
+) -> PyResult<Bound<'py, PyArray3<u8>>> {
+    let (reference, views) = (raster(&reference, "reference")?, sources(&images, &maps)?);
+    let planes = slice(&planes, "planes")?;
+    let costs = run(py, || mvcore::sweep::sweep(reference, &views, planes, best))?;
+    array(py, costs, [reference.height, reference.width, planes.len()])
+}
+
+#[pyfunction]
+pub fn aggregate<'py>(
+    py: Python<'py>,
+    costs: PyReadonlyArray3<'py, u8>,
+    guide: PyReadonlyArray2<'py, u8>,
+    p1: u8,
+    p2: u8,
+    p2_falloff: u8,
+) -> PyResult<(Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>)> {
+    let guide = raster(&guide, "guide")?;
+    let (planes, values) = (costs.shape()[2], slice(&costs, "costs")?);
+    let penalties = Penalties { p1, p2, p2_falloff };
+    let winners = run(py, || mvcore::aggregate::aggregate(values, planes, guide, penalties))?;
+    let shape = [guide.height, guide.width];
+    Ok((array(py, winners.plane, shape)?, array(py, winners.margin, shape)?))
+}
+
+#[pyfunction]
+#[pyo3(signature = (reference, images, maps, depths, backs, init, prior, *, iterations, low, high, step, max_slope, prior_weight, prior_reach, geometry_weight))]
+pub fn refine<'py>(
+    py: Python<'py>,
+    reference: PyReadonlyArray2<'py, u8>,
+    images: Vec<PyReadonlyArray2<'py, u8>>,
+    maps: PyReadonlyArray2<'py, f32>,
+    depths: Vec<PyReadonlyArray2<'py, f32>>,
+    backs: PyReadonlyArray2<'py, f32>,
+    init: PyReadonlyArray3<'py, f32>,
+    prior: PyReadonlyArray2<'py, f32>,
+    iterations: usize,
+    low: f32,
+    high: f32,
+    step: f32,
+    max_slope: f32,
+    prior_weight: f32,
+    prior_reach: f32,
+    geometry_weight: f32,
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
+    let (reference, views) = (raster(&reference, "reference")?, sources(&images, &maps)?);
+    let surfaces: Vec<SourceSurface> = rasters(&depths, "depths")?
+        .into_iter()
+        .zip(map_of(&backs, depths.len(), "backs")?)
+        .map(|(depth, back)| SourceSurface { depth, back })
+        .collect();
+    let init: Vec<Hypothesis> = slice(&init, "init")?
+        .chunks_exact(4)
+        .map(|h| Hypothesis { w: h[0], a: h[1], b: h[2], cost: h[3] })
+        .collect();
+    let prior = slice(&prior, "prior")?;
+    let params =
+        RefineParams { iterations, range: (low, high), step, max_slope, prior_weight, prior_reach, geometry_weight };
+    let planes = run(py, || mvcore::slanted::refine(reference, &views, &surfaces, &init, prior, &params))?;
+    let flat = planes.into_iter().flat_map(|h| [h.w, h.a, h.b, h.cost]).collect();
+    array(py, flat, [reference.height, reference.width, 4])
+}

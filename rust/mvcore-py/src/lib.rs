@@ -1,0 +1,24 @@
+//! The Python module `mvcore._core`: check, borrow, detach, call, convert. Nothing is computed here.
+
+mod convert;
+mod depth;
+mod files;
+mod sparse;
+mod texture;
+mod volume;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+mod _core {
+    #[pymodule_export]
+    use crate::depth::{aggregate, refine, sweep};
+    #[pymodule_export]
+    use crate::files::{encode_png, read_obj};
+    #[pymodule_export]
+    use crate::sparse::match_epipolar;
+    #[pymodule_export]
+    use crate::texture::{build_atlas, rasterize, rate_faces, select_views};
+    #[pymodule_export]
+    use crate::volume::{components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest_distance};
+}

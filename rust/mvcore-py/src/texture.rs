@@ -1,0 +1,122 @@
+//! Bindings of the mesh and texture kernels.
+
+use crate::convert::{array, raster, run, slice};
+use mvcore::atlas::Source;
+use mvcore::mesh::Mesh;
+use mvcore::raster::Raster;
+use mvcore::select_views::{Photo, Rating, SelectParams};
+use numpy::{
+    PyArray1, PyArray2, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+fn mesh<'a>(
+    vertices: &'a PyReadonlyArray2<'_, f64>,
+    faces: &'a PyReadonlyArray2<'_, u32>,
+) -> PyResult<(&'a [[f64; 3]], &'a [[u32; 3]])> {
+    if vertices.shape()[1] != 3 || faces.shape()[1] != 3 {
+        return Err(PyValueError::new_err("vertices, faces: expected shape (n, 3)"));
+    }
+    Ok((slice(vertices, "vertices")?.as_chunks::<3>().0, slice(faces, "faces")?.as_chunks::<3>().0))
+}
+
+fn projection(p: &PyReadonlyArray2<'_, f64>) -> PyResult<[f64; 12]> {
+    slice(p, "projection")?.try_into().map_err(|_| PyValueError::new_err("projection: expected shape (3, 4)"))
+}
+
+fn rgb<'a>(image: &'a PyReadonlyArray3<'_, u8>) -> PyResult<Raster<'a, u8>> {
+    let [h, w, 3] = *image.shape() else {
+        return Err(PyValueError::new_err("rgb: expected shape (h, w, 3)"));
+    };
+    Raster::new(slice(image, "rgb")?, 3 * w, h, "rgb").map_err(|e| PyValueError::new_err(e.to_string()))
+}
+
+#[pyfunction]
+pub fn rasterize<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    matrix: PyReadonlyArray2<'py, f64>,
+    width: usize,
+    height: usize,
+) -> PyResult<(Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<i32>>)> {
+    let ((v, f), p) = (mesh(&vertices, &faces)?, projection(&matrix)?);
+    let (depth, face) = run(py, || mvcore::rasterize::rasterize(Mesh::new(v, f)?, &p, width, height))?;
+    Ok((array(py, depth, [height, width])?, array(py, face, [height, width])?))
+}
+
+#[pyfunction]
+pub fn rate_faces<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    image: PyReadonlyArray3<'py, u8>,
+    detail: PyReadonlyArray2<'py, f32>,
+    depth: PyReadonlyArray2<'py, f32>,
+    matrix: PyReadonlyArray2<'py, f64>,
+    center: [f64; 3],
+    tolerance: f64,
+) -> PyResult<(Bound<'py, PyArray1<f32>>, Bound<'py, PyArray2<u8>>)> {
+    let ((v, f), projection) = (mesh(&vertices, &faces)?, projection(&matrix)?);
+    let (rgb, detail, depth) = (rgb(&image)?, raster(&detail, "detail")?, raster(&depth, "depth")?);
+    let photo = Photo { rgb, detail, depth, projection, center };
+    let ratings = run(py, || mvcore::select_views::rate(Mesh::new(v, f)?, &photo, tolerance))?;
+    let n = ratings.len();
+    let quality = ratings.iter().map(|r| r.quality).collect();
+    let colours: Vec<u8> = ratings.iter().flat_map(|r| r.colour).collect();
+    Ok((array(py, quality, [n])?, array(py, colours, [n, 3])?))
+}
+
+#[pyfunction]
+pub fn select_views<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    qualities: Vec<PyReadonlyArray1<'py, f32>>,
+    colours: Vec<PyReadonlyArray2<'py, u8>>,
+    seam: f32,
+    outlier: f32,
+    least_patch: usize,
+) -> PyResult<Bound<'py, PyArray1<i32>>> {
+    let (v, f) = mesh(&vertices, &faces)?;
+    let rating = |(q, c): (&PyReadonlyArray1<'py, f32>, &PyReadonlyArray2<'py, u8>)| -> PyResult<Vec<Rating>> {
+        let colours = slice(c, "colours")?.as_chunks::<3>().0;
+        Ok(slice(q, "qualities")?.iter().zip(colours).map(|(&quality, &colour)| Rating { quality, colour }).collect())
+    };
+    let ratings = qualities.iter().zip(&colours).map(rating).collect::<PyResult<Vec<_>>>()?;
+    let params = SelectParams { seam, outlier, least_patch };
+    let labels = run(py, || mvcore::select_views::select_views(Mesh::new(v, f)?, &ratings, &params))?;
+    let n = labels.len();
+    array(py, labels, [n])
+}
+
+#[pyfunction]
+pub fn build_atlas<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    labels: PyReadonlyArray1<'py, i32>,
+    images: Vec<PyReadonlyArray3<'py, u8>>,
+    matrices: Vec<PyReadonlyArray2<'py, f64>>,
+    gains: Vec<[f32; 3]>,
+    max_size: usize,
+) -> PyResult<(Bound<'py, PyArray1<u32>>, Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<u32>>, Bound<'py, PyArray3<u8>>)>
+{
+    let ((v, f), labels) = (mesh(&vertices, &faces)?, slice(&labels, "labels")?);
+    if matrices.len() != images.len() || gains.len() != images.len() {
+        return Err(PyValueError::new_err(format!("matrices, gains: expected {} of each", images.len())));
+    }
+    let source = |n: usize| -> PyResult<Source> {
+        Ok(Source { rgb: rgb(&images[n])?, projection: projection(&matrices[n])?, gain: gains[n] })
+    };
+    let sources = (0..images.len()).map(source).collect::<PyResult<Vec<_>>>()?;
+    let t = run(py, || mvcore::atlas::build_atlas(Mesh::new(v, f)?, labels, &sources, max_size))?;
+    let (n, count) = (t.origin.len(), t.faces.len());
+    Ok((
+        array(py, t.origin, [n])?,
+        array(py, t.texel.into_flattened(), [n, 2])?,
+        array(py, t.faces.into_flattened(), [count, 3])?,
+        array(py, t.atlas, [t.height, t.width, 3])?,
+    ))
+}

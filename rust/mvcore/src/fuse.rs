@@ -1,0 +1,420 @@
+//! Depth maps and silhouettes into a block-sparse truncated signed distance field (eqs 39-41 of the paper, for any pose).
+//!
+//! ```text
+//!   camera ───── free ─────┤+τ ... 0 ... -τ├── unknown ──►      per voxel: mean of clamp(depth - z, -τ, τ), weighted
+//! ```
+//!
+//! Voxels farther than τ in front of a surface get +τ from that view: free space carves what other views put there by mistake.
+//! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid. Curless and
+//! Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
+//! order: the same bytes for any thread count.
+
+use crate::error::{Error, Result, require};
+use crate::grid::{BLOCK, BlockMap, Grid, SIDE};
+use crate::raster::Raster;
+use multiversion::multiversion;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// One view's contribution.
+#[derive(Debug, Clone, Copy)]
+pub struct FusionView<'a> {
+    /// z-depth, 0 means none.
+    pub depth: Raster<'a, f32>,
+    /// Weight of each pixel's depth.
+    pub weight: Raster<'a, f32>,
+    /// Signed distance to the silhouette in pixels, positive outside it.
+    pub silhouette: Option<Raster<'a, f32>>,
+    /// P = K [R | t], row-major 3x4.
+    pub projection: [f64; 12],
+    /// Focal length in pixels, turns silhouette distances into world units.
+    pub focal: f64,
+}
+
+/// How views become a field.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FusionParams {
+    /// Truncation τ in world units.
+    pub truncation: f64,
+    /// Weight of a free-space observation relative to a surface one.
+    pub free_weight: f32,
+    /// Weight below which a voxel counts as unobserved.
+    pub min_weight: f32,
+    /// Share of the silhouettes that see a voxel and may disagree with its being inside.
+    pub hull_tolerance: f32,
+    /// Most bytes of the volume.
+    pub max_memory: usize,
+}
+
+/// Distances in units of τ (NaN where unobserved) of each block of the map.
+#[derive(Debug, Clone)]
+pub struct Volume {
+    /// Which blocks exist.
+    pub map: BlockMap,
+    /// `BLOCK` values a block, -1 (inside) ..= 1.
+    pub values: Vec<f32>,
+}
+
+/// Bytes a voxel takes while it is fused.
+const VOXEL_BYTES: usize = 4;
+
+/// Fuses the views into the blocks near their surfaces (with silhouettes: also all blocks inside the hull).
+pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<Volume> {
+    require(!views.is_empty(), "views", "at least one view", "none")?;
+    require(params.truncation > 0.0, "truncation", "a positive distance", params.truncation)?;
+    for view in views {
+        let same = view.weight.width == view.depth.width && view.weight.height == view.depth.height;
+        require(same, "weight", "the size of the depth map", format!("{} x {}", view.weight.height, view.weight.width))?;
+    }
+    let dims = grid.blocks();
+    let count = dims.iter().product::<usize>();
+    let table = count.saturating_mul(5);
+    if table > params.max_memory {
+        return Err(Error::OutOfMemory { what: "block table", needed: table, allowed: params.max_memory });
+    }
+    let flags: Vec<AtomicBool> = (0..count).map(|_| AtomicBool::new(false)).collect();
+    for view in views {
+        mark_surface(&grid, view, params.truncation, &flags);
+    }
+    let masked = views.iter().any(|v| v.silhouette.is_some());
+    if masked {
+        restrict_to_hull(&grid, views, params, &flags);
+    }
+    let map = BlockMap::from_flags(dims, flags.iter().map(|f| f.load(Ordering::Relaxed)));
+    let needed = map.coords.len() * BLOCK * VOXEL_BYTES + table;
+    if needed > params.max_memory {
+        return Err(Error::OutOfMemory { what: "volume", needed, allowed: params.max_memory });
+    }
+    let mut values = vec![f32::NAN; map.coords.len() * BLOCK];
+    values.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).for_each(|(out, at)| {
+        integrate(&grid, *at, views, params, masked, out);
+    });
+    Ok(Volume { map, values })
+}
+
+/// Marks the blocks within τ of a view's surface, walking each pixel's ray.
+fn mark_surface(grid: &Grid, view: &FusionView, truncation: f64, flags: &[AtomicBool]) {
+    let dims = grid.blocks();
+    let block = grid.voxel * SIDE as f64;
+    let rays = Rays::of(&view.projection);
+    (0..view.depth.height).into_par_iter().for_each(|y| {
+        for (x, &z) in view.depth.row(y).iter().enumerate() {
+            if z <= 0.0 {
+                continue;
+            }
+            let direction = rays.direction(x as f64, y as f64);
+            let stride = ((block / 3.0 * view.focal / f64::from(z)) as usize).max(1);
+            if x % stride != 0 || y % stride != 0 {
+                continue;
+            }
+            let reach = truncation + 0.5 * block / 3.0;
+            let steps = (2.0 * reach / (block / 3.0)).ceil() as i32;
+            for s in 0..=steps {
+                let along = f64::from(z) - reach + 2.0 * reach * f64::from(s) / f64::from(steps);
+                let p: [f64; 3] = std::array::from_fn(|a| rays.center[a] + direction[a] * along - grid.origin[a]);
+                let b = p.map(|v| (v / block).floor());
+                if (0..3).all(|a| b[a] >= 0.0 && b[a] < dims[a] as f64) {
+                    let index = (b[0] as usize * dims[1] + b[1] as usize) * dims[2] + b[2] as usize;
+                    flags[index].store(true, Ordering::Relaxed);
+                }
+            }
+        }
+    });
+}
+
+/// Back-projection of pixels: direction with z-depth 1.
+struct Rays {
+    center: [f64; 3],
+    inverse: nalgebra::Matrix3<f64>,
+}
+
+impl Rays {
+    fn of(p: &[f64; 12]) -> Self {
+        let m = nalgebra::Matrix3::from_fn(|r, c| p[4 * r + c]);
+        let inverse = m.try_inverse().unwrap_or_else(nalgebra::Matrix3::identity);
+        let center = -(inverse * nalgebra::Vector3::new(p[3], p[7], p[11]));
+        Self { center: center.into(), inverse }
+    }
+
+    fn direction(&self, x: f64, y: f64) -> [f64; 3] {
+        (self.inverse * nalgebra::Vector3::new(x, y, 1.0)).into()
+    }
+}
+
+/// Unmarks blocks outside the hull and marks all those inside it.
+fn restrict_to_hull(grid: &Grid, views: &[FusionView], params: &FusionParams, flags: &[AtomicBool]) {
+    let dims = grid.blocks();
+    let half = 0.5 * SIDE as f64;
+    let radius = (half * grid.voxel * 3f64.sqrt()) as f32;
+    flags.par_iter().enumerate().for_each(|(index, flag)| {
+        let (i, rest) = (index / (dims[1] * dims[2]), index % (dims[1] * dims[2]));
+        let corner = [i, rest / dims[2], rest % dims[2]];
+        let p = std::array::from_fn(|a| grid.origin[a] + grid.voxel * (corner[a] as f64 * SIDE as f64 + half));
+        // A block on the border of the hull lies within its radius of it.
+        flag.store(hull_distance(p, views, params.hull_tolerance) < radius * 1.2, Ordering::Relaxed);
+    });
+}
+
+const MAX_SILHOUETTES: usize = 256;
+
+/// Signed distance to the visual hull (positive outside), to first order near its surface; the views' vote.
+fn hull_distance(p: [f64; 3], views: &[FusionView], tolerance: f32) -> f32 {
+    let mut outside = [f32::MIN; MAX_SILHOUETTES];
+    let mut seen = 0;
+    for view in views.iter().take(MAX_SILHOUETTES) {
+        let Some(silhouette) = &view.silhouette else { continue };
+        let m = &view.projection;
+        let q: [f64; 3] =
+            std::array::from_fn(|r| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
+        if q[2] <= 0.0 {
+            continue;
+        }
+        let (u, v) = (q[0] / q[2], q[1] / q[2]);
+        let (w, h) = (silhouette.width as f64, silhouette.height as f64);
+        if u < 0.0 || v < 0.0 || u > w - 1.0 || v > h - 1.0 {
+            continue;
+        }
+        let (x, y) = (u as usize, v as usize);
+        let (x1, y1) = ((x + 1).min(silhouette.width - 1), (y + 1).min(silhouette.height - 1));
+        let (a, b) = ((u - x as f64) as f32, (v - y as f64) as f32);
+        let at = |x: usize, y: usize| silhouette.data[y * silhouette.width + x];
+        let pixels =
+            (1.0 - b) * ((1.0 - a) * at(x, y) + a * at(x1, y)) + b * ((1.0 - a) * at(x, y1) + a * at(x1, y1));
+        outside[seen] = pixels * (q[2] / view.focal) as f32;
+        seen += 1;
+    }
+    if seen == 0 {
+        return f32::MAX;
+    }
+    let allowed = ((seen as f32 * tolerance) as usize).min(seen - 1);
+    let (_, &mut nth, _) = outside[..seen].select_nth_unstable_by(allowed, |a, b| b.total_cmp(a));
+    nth
+}
+
+/// One view as f32 increments over a block: homogeneous pixel of voxel (i, j, k) = base + i·di + j·dj + k·dk.
+struct Stepper {
+    base: [f32; 3],
+    di: [f32; 3],
+    dj: [f32; 3],
+    dk: [f32; 3],
+}
+
+impl Stepper {
+    fn new(grid: &Grid, at: [u32; 3], m: &[f64; 12]) -> Self {
+        let p: [f64; 3] =
+            std::array::from_fn(|a| grid.origin[a] + grid.voxel * f64::from(at[a]) * SIDE as f64);
+        let row = |r: usize| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3];
+        let column = |c: usize| std::array::from_fn(|r| (m[4 * r + c] * grid.voxel) as f32);
+        Self { base: std::array::from_fn(|r| row(r) as f32), di: column(0), dj: column(1), dk: column(2) }
+    }
+
+    /// Whether no voxel of the block can fall on the image.
+    fn misses(&self, width: usize, height: usize) -> bool {
+        let corner = |c: usize, r: usize| {
+            let f = |bit: usize| if c >> bit & 1 == 1 { (SIDE - 1) as f32 } else { 0.0 };
+            self.base[r] + f(0) * self.di[r] + f(1) * self.dj[r] + f(2) * self.dk[r]
+        };
+        let all = |test: &dyn Fn(f32, f32, f32) -> bool| (0..8).all(|c| test(corner(c, 0), corner(c, 1), corner(c, 2)));
+        all(&|_, _, z| z <= 0.0)
+            || (all(&|_, _, z| z > 0.0)
+                && (all(&|x, _, z| x < -0.5 * z)
+                    || all(&|_, y, z| y < -0.5 * z)
+                    || all(&|x, _, z| x > (width as f32 - 0.5) * z)
+                    || all(&|_, y, z| y > (height as f32 - 0.5) * z)))
+    }
+}
+
+#[multiversion(targets(
+    "x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma+bmi2",
+    "x86_64+avx2+fma+bmi2",
+    "aarch64+neon"
+))]
+fn integrate(
+    grid: &Grid,
+    at: [u32; 3],
+    views: &[FusionView],
+    params: &FusionParams,
+    masked: bool,
+    out: &mut [f32],
+) {
+    let inverse_truncation = (1.0 / params.truncation) as f32;
+    let mut sum = [0.0f32; BLOCK];
+    let mut total = [0.0f32; BLOCK];
+    for view in views {
+        let stepper = Stepper::new(grid, at, &view.projection);
+        if stepper.misses(view.depth.width, view.depth.height) {
+            continue;
+        }
+        for (row, (sum, total)) in
+            sum.as_chunks_mut::<SIDE>().0.iter_mut().zip(total.as_chunks_mut::<SIDE>().0).enumerate()
+        {
+            let (i, j) = ((row / SIDE) as f32, (row % SIDE) as f32);
+            add_row(view, &stepper, i, j, inverse_truncation, params.free_weight, sum, total);
+        }
+    }
+    for (v, (s, t)) in out.iter_mut().zip(sum.iter().zip(&total)) {
+        *v = if *t > params.min_weight { s / t } else if masked { -1.0 } else { f32::NAN };
+    }
+    if masked {
+        cut_by_hull(grid, at, views, params, out);
+    }
+}
+
+#[inline(always)]
+fn add_row(
+    view: &FusionView,
+    stepper: &Stepper,
+    i: f32,
+    j: f32,
+    inverse_truncation: f32,
+    free_weight: f32,
+    sum: &mut [f32; SIDE],
+    total: &mut [f32; SIDE],
+) {
+    let base: [f32; 3] = std::array::from_fn(|r| stepper.base[r] + i * stepper.di[r] + j * stepper.dj[r]);
+    let (mut u, mut v, mut z) = ([0.0f32; SIDE], [0.0f32; SIDE], [0.0f32; SIDE]);
+    for k in 0..SIDE {
+        let f = k as f32;
+        z[k] = base[2] + f * stepper.dk[2];
+        let inverse = 1.0 / z[k].max(1e-20);
+        u[k] = (base[0] + f * stepper.dk[0]) * inverse;
+        v[k] = (base[1] + f * stepper.dk[1]) * inverse;
+    }
+    let (mut depth, mut weight) = ([0.0f32; SIDE], [0.0f32; SIDE]);
+    for k in 0..SIDE {
+        if z[k] > 0.0 {
+            (depth[k], weight[k]) = sample(view, u[k], v[k], z[k], inverse_truncation);
+        }
+    }
+    for k in 0..SIDE {
+        let distance = (depth[k] - z[k]) * inverse_truncation;
+        let w = if distance < -1.0 {
+            0.0
+        } else if distance > 1.0 {
+            weight[k] * free_weight
+        } else {
+            weight[k]
+        };
+        sum[k] += w * distance.min(1.0).max(-1.0);
+        total[k] += w;
+    }
+}
+
+/// Depth and weight at a pixel position; weight 0 outside the image and where there is no depth. Between four pixels of
+/// one surface the depth is interpolated, at a depth edge the nearest pixel counts.
+#[inline(always)]
+fn sample(view: &FusionView, u: f32, v: f32, z: f32, inverse_truncation: f32) -> (f32, f32) {
+    let (w, h) = (view.depth.width, view.depth.height);
+    if !(u >= -0.5 && v >= -0.5 && u < w as f32 - 0.5 && v < h as f32 - 0.5) {
+        return (0.0, 0.0);
+    }
+    let (x, y) = ((u + 0.5) as usize, (v + 0.5) as usize);
+    let (nearest, weight) = (view.depth.data[y * w + x], view.weight.data[y * w + x]);
+    if nearest <= 0.0 || (nearest - z) * inverse_truncation < -1.5 {
+        return (nearest, if nearest > 0.0 { weight } else { 0.0 });
+    }
+    let (x0, y0) = (u.max(0.0) as usize, v.max(0.0) as usize);
+    let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
+    let d = &view.depth.data;
+    let (p, q, r, s) = (d[y0 * w + x0], d[y0 * w + x1], d[y1 * w + x0], d[y1 * w + x1]);
+    let low = p.min(q).min(r).min(s);
+    let high = p.max(q).max(r).max(s);
+    if low <= 0.0 || (high - low) * inverse_truncation > 1.0 {
+        return (nearest, weight);
+    }
+    let (a, b) = (u.max(0.0) - x0 as f32, v.max(0.0) - y0 as f32);
+    let top = p + a * (q - p);
+    (top + b * (r + a * (s - r) - top), weight)
+}
+
+fn cut_by_hull(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionParams, out: &mut [f32]) {
+    let inverse = (1.0 / params.truncation) as f32;
+    for (n, v) in out.iter_mut().enumerate() {
+        let local = [n / (SIDE * SIDE), n / SIDE % SIDE, n % SIDE];
+        let p = std::array::from_fn(|a| {
+            grid.origin[a] + grid.voxel * (f64::from(at[a]) * SIDE as f64 + local[a] as f64)
+        });
+        let hull = hull_distance(p, views, params.hull_tolerance);
+        *v = v.max((hull * inverse).clamp(-1.0, 1.0));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A camera at (0, 0, -4) looking along +z, focal length 60, 64x64; a plane at z = 0 (depth 4).
+    fn projection() -> [f64; 12] {
+        [60., 0., 31.5, 126., 0., 60., 31.5, 126., 0., 0., 1., 4.]
+    }
+
+    const PARAMS: FusionParams =
+        FusionParams { truncation: 0.2, free_weight: 1.0, min_weight: 0.0, hull_tolerance: 0.0, max_memory: 1 << 30 };
+
+    fn grid() -> Grid {
+        Grid::new([-1.0, -1.0, -1.0], 0.05, [41, 41, 41]).unwrap()
+    }
+
+    #[test]
+    fn a_plane_becomes_its_distance() {
+        let (depth, weight) = (vec![4.0f32; 64 * 64], vec![1.0f32; 64 * 64]);
+        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
+        let view = FusionView {
+            depth: raster(&depth),
+            weight: raster(&weight),
+            silhouette: None,
+            projection: projection(),
+            focal: 60.0,
+        };
+        let volume = fuse(grid(), &[view], &PARAMS).unwrap();
+        assert!(!volume.map.coords.is_empty());
+        for (c, block) in volume.map.coords.iter().zip(volume.values.chunks_exact(BLOCK)) {
+            for (n, &v) in block.iter().enumerate() {
+                let z = -1.0 + 0.05 * (c[2] as f32 * 8.0 + (n % 8) as f32);
+                let expected = (-z / 0.2).min(1.0);
+                if z > 0.2001 {
+                    assert!(v.is_nan());
+                } else if z < 0.1999 {
+                    assert!((v - expected).abs() < 1e-4, "z {z}: {v} {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_hull_is_solid_where_no_depth_reaches() {
+        let (depth, weight) = (vec![0.0f32; 64 * 64], vec![0.0f32; 64 * 64]);
+        let outside: Vec<f32> =
+            (0..64 * 64).map(|i| (((i % 64) as f32 - 31.5).hypot((i / 64) as f32 - 31.5)) - 6.0).collect();
+        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
+        let view = FusionView {
+            depth: raster(&depth),
+            weight: raster(&weight),
+            silhouette: Some(raster(&outside)),
+            projection: projection(),
+            focal: 60.0,
+        };
+        let volume = fuse(grid(), &[view], &PARAMS).unwrap();
+        let value = |i: usize, j: usize, k: usize| {
+            let slot = volume.map.at(i / 8, j / 8, k / 8) as usize;
+            volume.values[slot * BLOCK + (i % 8) * 64 + (j % 8) * 8 + k % 8]
+        };
+        assert!(value(20, 20, 20) < -0.9);
+        assert!(value(20, 29, 20) > 0.0); // 0.45 to the side: 6.75 px
+    }
+
+    #[test]
+    fn too_large_a_volume_is_refused() {
+        let (depth, weight) = (vec![4.0f32; 64 * 64], vec![1.0f32; 64 * 64]);
+        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
+        let view = FusionView {
+            depth: raster(&depth),
+            weight: raster(&weight),
+            silhouette: None,
+            projection: projection(),
+            focal: 60.0,
+        };
+        let error = fuse(grid(), &[view], &FusionParams { max_memory: 4000, ..PARAMS }).unwrap_err();
+        assert!(matches!(error, Error::OutOfMemory { .. }));
+    }
+}

@@ -1,0 +1,26 @@
+//! Multi-view stereo kernels in plain Rust: arrays in, arrays out, no Python, no I/O beyond mesh and atlas files.
+//!
+//! Order of the modules: [`error`] ← nouns ([`raster`]) ← one file a kernel. Kernels never call each other, but for the sample
+//! loop [`patch`] that [`slanted`] runs on. Threads come from rayon's global pool; every kernel gives the same bytes for
+//! any number of them.
+
+pub mod aggregate;
+pub mod atlas;
+pub mod consistency;
+pub mod cube;
+pub mod error;
+pub mod files;
+pub mod fuse;
+pub mod grid;
+pub mod isosurface;
+pub mod match_epipolar;
+pub mod mesh;
+pub mod nearest;
+pub mod patch;
+pub mod raster;
+pub mod rasterize;
+pub mod select_views;
+pub mod slanted;
+pub mod sweep;
+
+pub use error::{Error, Result};

@@ -1,0 +1,187 @@
+//! Sums over a slanted window: the inner loop of [`crate::slanted`], eight samples at a time where the CPU has AVX2.
+//!
+//! A source image is stored as [`Quads`]: each pixel with its right, lower and lower-right neighbour in one 32-bit word, so
+//! that one gather fetches all four taps of a bilinear sample. The only `unsafe` code of the crate lives here.
+
+use crate::raster::Raster;
+
+/// Window samples, padded to a multiple of eight with zero weights.
+pub const SAMPLES: usize = 40;
+
+/// Offsets of the samples from the window's centre: the checkerboard inside a disc of radius 4.5.
+pub static OFFSETS: ([f32; SAMPLES], [f32; SAMPLES], usize) = {
+    let (mut dx, mut dy, mut n) = ([0.0; SAMPLES], [0.0; SAMPLES], 0);
+    let mut y = -4i32;
+    while y <= 4 {
+        let mut x = -4i32;
+        while x <= 4 {
+            if (x + y) % 2 == 0 && x * x + y * y <= 20 {
+                dx[n] = x as f32;
+                dy[n] = y as f32;
+                n += 1;
+            }
+            x += 1;
+        }
+        y += 1;
+    }
+    (dx, dy, n)
+};
+
+/// An image whose every word holds the 2x2 pixels from it on: `p(x, y) | p(x+1, y) << 8 | p(x, y+1) << 16 | ..`.
+pub struct Quads {
+    words: Vec<u32>,
+    width: usize,
+    height: usize,
+}
+
+impl Quads {
+    /// Packs an image; the last row and column repeat.
+    pub fn new(image: Raster<u8>) -> Self {
+        let (w, h) = (image.width, image.height);
+        let mut words = Vec::with_capacity(w * h);
+        for y in 0..h {
+            let (a, b) = (image.row(y), image.row((y + 1).min(h - 1)));
+            for x in 0..w {
+                let r = (x + 1).min(w - 1);
+                words.push(u32::from_le_bytes([a[x], a[r], b[x], b[r]]));
+            }
+        }
+        Self { words, width: w, height: h }
+    }
+
+    /// Whether the position lies on the image.
+    #[inline(always)]
+    pub fn sees(&self, u: f32, v: f32) -> bool {
+        u >= 0.0 && v >= 0.0 && u <= (self.width - 1) as f32 && v <= (self.height - 1) as f32
+    }
+}
+
+/// The reference side of a window: weights and weighted values of its samples.
+#[derive(Clone)]
+pub struct Window {
+    /// Sample weights, summing to 1.
+    pub weight: [f32; SAMPLES],
+    /// Weight times grey value.
+    pub weighted: [f32; SAMPLES],
+}
+
+/// Where the window's samples fall in the source: `(u, v) + dx (ux, vx) + dy (uy, vy)`.
+#[derive(Debug, Clone, Copy)]
+pub struct Affine {
+    /// Column of the centre.
+    pub u: f32,
+    /// Row of the centre.
+    pub v: f32,
+    /// d u / d x, d v / d x, d u / d y, d v / d y.
+    pub jacobian: [f32; 4],
+}
+
+/// `(Σ w s, Σ w s², Σ w r s)` of source samples s and reference samples r.
+pub type SumsOf = fn(&Quads, &Window, Affine) -> [f32; 3];
+
+/// The fastest [`SumsOf`] this CPU can run.
+pub fn sums_for_this_cpu() -> SumsOf {
+    #[cfg(target_arch = "x86_64")]
+    if std::is_x86_feature_detected!("avx2") && std::is_x86_feature_detected!("fma") {
+        // SAFETY: the CPU has the features that the function is compiled for, checked just above.
+        return |q, w, a| unsafe { sums_avx2(q, w, a) };
+    }
+    sums_portable
+}
+
+/// The readable twin.
+pub fn sums_portable(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
+    let (dx, dy, n) = (&OFFSETS.0, &OFFSETS.1, OFFSETS.2);
+    let [ux, vx, uy, vy] = at.jacobian;
+    let (x_max, y_max) = ((source.width - 1) as f32, (source.height - 1) as f32);
+    let mut sums = [0.0; 3];
+    for i in 0..n {
+        let u = (at.u + dx[i] * ux + dy[i] * uy).clamp(0.0, x_max);
+        let v = (at.v + dx[i] * vx + dy[i] * vy).clamp(0.0, y_max);
+        let (x, y) = (u as usize, v as usize);
+        let (fx, fy) = (u - x as f32, v - y as f32);
+        let [a, b, c, d] = source.words[y * source.width + x].to_le_bytes().map(f32::from);
+        let (top, bottom) = (a + fx * (b - a), c + fx * (d - c));
+        let s = top + fy * (bottom - top);
+        sums[0] += window.weight[i] * s;
+        sums[1] += window.weight[i] * s * s;
+        sums[2] += window.weighted[i] * s;
+    }
+    sums
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn sums_avx2(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
+    use std::arch::x86_64::*;
+    let zero = _mm256_setzero_ps();
+    let (x_max, y_max) = (_mm256_set1_ps((source.width - 1) as f32), _mm256_set1_ps((source.height - 1) as f32));
+    let [ux, vx, uy, vy] = at.jacobian.map(|j| _mm256_set1_ps(j));
+    let (u0, v0) = (_mm256_set1_ps(at.u), _mm256_set1_ps(at.v));
+    let stride = _mm256_set1_epi32(source.width as i32);
+    let byte = _mm256_set1_epi32(0xff);
+    let (mut s1, mut s2, mut rs) = (zero, zero, zero);
+    for i in (0..SAMPLES).step_by(8) {
+        // SAFETY: i + 8 <= SAMPLES, the length of all four arrays.
+        let (dx, dy, weight, weighted) = unsafe {
+            (
+                _mm256_loadu_ps(OFFSETS.0.as_ptr().add(i)),
+                _mm256_loadu_ps(OFFSETS.1.as_ptr().add(i)),
+                _mm256_loadu_ps(window.weight.as_ptr().add(i)),
+                _mm256_loadu_ps(window.weighted.as_ptr().add(i)),
+            )
+        };
+        let u = _mm256_fmadd_ps(dx, ux, _mm256_fmadd_ps(dy, uy, u0));
+        let v = _mm256_fmadd_ps(dx, vx, _mm256_fmadd_ps(dy, vy, v0));
+        // max first: it returns its second operand for NaN, so that the index below is always inside.
+        let u = _mm256_min_ps(_mm256_max_ps(u, zero), x_max);
+        let v = _mm256_min_ps(_mm256_max_ps(v, zero), y_max);
+        let (x, y) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
+        let (fx, fy) = (_mm256_sub_ps(u, _mm256_cvtepi32_ps(x)), _mm256_sub_ps(v, _mm256_cvtepi32_ps(y)));
+        let index = _mm256_add_epi32(_mm256_mullo_epi32(y, stride), x);
+        // SAFETY: 0 <= x < width and 0 <= y < height by the clamps, and `words` holds width * height words.
+        let quad = unsafe { _mm256_i32gather_epi32::<4>(source.words.as_ptr().cast::<i32>(), index) };
+        let tap = |shifted| _mm256_cvtepi32_ps(_mm256_and_si256(shifted, byte));
+        let (a, b) = (tap(quad), tap(_mm256_srli_epi32::<8>(quad)));
+        let (c, d) = (tap(_mm256_srli_epi32::<16>(quad)), tap(_mm256_srli_epi32::<24>(quad)));
+        let top = _mm256_fmadd_ps(fx, _mm256_sub_ps(b, a), a);
+        let bottom = _mm256_fmadd_ps(fx, _mm256_sub_ps(d, c), c);
+        let s = _mm256_fmadd_ps(fy, _mm256_sub_ps(bottom, top), top);
+        let ws = _mm256_mul_ps(weight, s);
+        s1 = _mm256_add_ps(s1, ws);
+        s2 = _mm256_fmadd_ps(ws, s, s2);
+        rs = _mm256_fmadd_ps(weighted, s, rs);
+    }
+    [s1, s2, rs].map(|lanes| {
+        let half = _mm_add_ps(_mm256_castps256_ps128(lanes), _mm256_extractf128_ps::<1>(lanes));
+        let pair = _mm_add_ps(half, _mm_movehl_ps(half, half));
+        _mm_cvtss_f32(_mm_add_ss(pair, _mm_shuffle_ps::<1>(pair, pair)))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn this_cpus_sums_equal_the_portable_ones(
+            u in -20.0f32..60.0, v in -20.0f32..50.0, jacobian in prop::array::uniform4(-2.0f32..2.0), seed in any::<u32>(),
+        ) {
+            let hash = |i: u32| (i.wrapping_mul(2654435761).wrapping_add(seed) >> 13) as u8;
+            let pixels: Vec<u8> = (0..40 * 30).map(hash).collect();
+            let quads = Quads::new(Raster::new(&pixels, 40, 30, "source").unwrap());
+            let mut window = Window { weight: [0.0; SAMPLES], weighted: [0.0; SAMPLES] };
+            for i in 0..OFFSETS.2 {
+                window.weight[i] = 1.0 / OFFSETS.2 as f32;
+                window.weighted[i] = window.weight[i] * f32::from(hash(i as u32 + 9000));
+            }
+            let at = Affine { u, v, jacobian };
+            let (fast, slow) = (sums_for_this_cpu()(&quads, &window, at), sums_portable(&quads, &window, at));
+            for k in 0..3 {
+                prop_assert!((fast[k] - slow[k]).abs() <= 1e-4 * slow[k].abs().max(1.0), "{fast:?} {slow:?}");
+            }
+        }
+    }
+}
