@@ -1,8 +1,8 @@
 """Calibrated multi-view images in, a textured 3D mesh out.
 
-    scene = mvcore.load("fountain/")
-    result = mvcore.reconstruct(scene.frames, scene.calib)
-    result.save("fountain.glb")
+scene = mvcore.load("fountain/")
+result = mvcore.reconstruct(scene.frames, scene.calib)
+result.save("fountain.glb")
 """
 
 from importlib.metadata import version as _version

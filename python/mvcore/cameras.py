@@ -102,7 +102,7 @@ class Camera:
         sizes = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
         require(d.size in sizes, who + "distortion", f"{' or '.join(map(str, sizes))} coefficients", d.size)
         require(np.isfinite(d).all(), who + "distortion", "finite numbers", "NaN or infinity")
-        for key, value in dict(K=k, R=r, t=t, distortion=d, width=int(self.width), height=int(self.height)).items():
+        for key, value in {"K": k, "R": r, "t": t, "distortion": d, "width": int(self.width), "height": int(self.height)}.items():
             object.__setattr__(self, key, value)
 
     @classmethod
@@ -110,7 +110,12 @@ class Camera:
         """From a bare 3x4 matrix P ~ K [R | t] (any scale and sign), decomposed by RQ."""
         p = _matrix("projection", projection, (3, 4))
         m = p[:, :3]
-        require(abs(np.linalg.det(m)) > 1e-12 * np.linalg.norm(m) ** 3, "projection", "an invertible left 3x3 block", "a singular one")
+        require(
+            abs(np.linalg.det(m)) > 1e-12 * np.linalg.norm(m) ** 3,
+            "projection",
+            "an invertible left 3x3 block",
+            "a singular one",
+        )
         if np.linalg.det(m) < 0:
             p, m = -p, -m
         q, r = np.linalg.qr(np.linalg.inv(m))  # inv(K R) = Rᵀ K⁻¹

@@ -59,7 +59,7 @@ class DepthConfig:
     """Grey levels of an image edge at which `p2` has halved."""
     sweep_rounds: int = 3
     """Rounds of slanted refinement at the sweep's scale, where they are cheap."""
-    rounds: int = 2
+    rounds: int = 1
     """Rounds at each finer scale."""
     max_slant: float = 76.0
     """Degrees between a surface's normal and the view: flatter surfaces cannot be matched."""
@@ -70,8 +70,8 @@ class DepthConfig:
     max_image_size: int = 1600
     """Pixels: longer sides are reduced to this; detail beyond costs time and rarely adds shape."""
     geometry_weight: float = 0.2
-    """Cost of missing the other views' surfaces by three pixels or more, in units of 1 - ZNCC (ACMM's value)."""
-    geometry_rounds: int = 2
+    """Cost of missing the other views' surfaces by three pixels or more, in units of 1 - ZNCC."""
+    geometry_rounds: int = 1
     """Rounds at half the size once the other views' depth is known."""
     min_views: int = 1
     """Fewest other views that must agree with a depth, at the tightest tolerance."""
@@ -79,8 +79,6 @@ class DepthConfig:
     """Pixels of reprojection error allowed per agreeing view."""
     depth_unit: float = 1.0 / 600.0
     """Relative depth error allowed per agreeing view."""
-    max_cost: float = 0.8
-    """1 - ZNCC above which a depth is dropped: unrelated patches have about 1."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +87,17 @@ class VolumeConfig:
 
     voxel: float | None = None
     """World units; by default `footprints` pixel footprints of the target."""
-    footprints: float = 1.25
+    footprints: float = 1.5
     """Pixel footprints a voxel: below 1 there is nothing to resolve, above 1.5 detail is lost."""
     truncation: float = 4.0
     """Voxels on either side of a surface that carry its distance."""
     free_weight: float = 0.3
     """Weight of seeing through a voxel against seeing a surface there."""
     min_weight: float = 0.05
-    """Weight below which a voxel counts as never seen; 1 is a confident depth at the target's distance."""
-    hull_tolerance: float = 0.05
+    """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
+    solid_weight: float = 1.0
+    """With masks: free-space weight that carves the inside of the hull where no surface was seen; more than one wrong view has."""
+    hull_tolerance: float = 0.03
     """Share of the silhouettes that may disagree: one wrong mask among many does no harm."""
     max_memory: int = 4 << 30
     """Bytes of the volume; the voxels grow until it fits, and the report says so."""

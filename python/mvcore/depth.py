@@ -80,6 +80,8 @@ class _Scale:
     max_slope: float
 
 
+LEAST_CONFIDENCE = 0.1
+"""Even surfaces correlate with nothing, but other views that agree with their depth make it worth something."""
 NO_DEPTHS: list[Map] = []
 NO_BACKS = np.zeros((0, 12), np.float32)
 
@@ -146,9 +148,7 @@ def _finer(coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig,
     prior = cv2.resize(coarse.prior, (w, h), interpolation=cv2.INTER_LINEAR)
     # One pixel of parallax is half as much inverse depth on an image twice as large.
     ratio = coarse.prior.shape[1] / w
-    planes = _refine(
-        scale, planes, prior, coarse.span, coarse.step * ratio, rounds, config, config.prior_reach / ratio, depths
-    )
+    planes = _refine(scale, planes, prior, coarse.span, coarse.step * ratio, rounds, config, config.prior_reach / ratio, depths)
     return replace(coarse, planes=planes)
 
 
@@ -157,9 +157,7 @@ def _pyramid(reference: View, sources: Sequence[View], config: DepthConfig) -> l
     for w, h in _scales(reference.camera.width, reference.camera.height, config.coarsest):
         share = w / reference.camera.width
         mine = reference.at(w, h)
-        theirs = [
-            s.at(max(2, round(s.camera.width * share)), max(2, round(s.camera.height * share))) for s in sources
-        ]
+        theirs = [s.at(max(2, round(s.camera.width * share)), max(2, round(s.camera.height * share))) for s in sources]
         there = np.stack([relative_map(mine.camera, s.camera) for s in theirs])
         back = np.stack([relative_map(s.camera, mine.camera) for s in theirs])
         slope = float(np.tan(np.radians(config.max_slant)) / mine.camera.K[0, 0])
@@ -185,9 +183,7 @@ class RoughDepth:
         return np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
 
 
-def sweep_depth(
-    reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None
-) -> RoughDepth:
+def sweep_depth(reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None) -> RoughDepth:
     """First pass: sweep, aggregation and refinement up to half the size.
 
     Parameters
@@ -216,15 +212,28 @@ def refine_depth(
     rough_sources: Sequence[RoughDepth],
     config: DepthConfig | None = None,
 ) -> DepthMap:
-    """Second pass: the planes are refined further, up to full size, with the sources' own depth as a witness."""
+    """Second pass: refined at half size with the sources' own depth as a witness, then at full size.
+
+    ``rough_sources`` are the first passes of the sources, one each, or empty.
+    """
     config = config or DepthConfig()
     found = rough.hypotheses
-    scales = _pyramid(reference, sources, config)[-2:]
-    for n, scale in enumerate(scales):
-        depths = [_resized(r.depth, grey.shape) for r, grey in zip(rough_sources, scale.greys[1:], strict=True)]
-        found = _finer(found, scale, config.rounds if n == len(scales) - 1 else config.geometry_rounds, config, depths)
+    half, full = ([None, *_pyramid(reference, sources, config)])[-2:]
+    if half is not None and len(rough_sources):
+        depths = [_resized(r.depth, grey.shape) for r, grey in zip(rough_sources, half.greys[1:], strict=True)]
+        found = _finer(found, half, config.geometry_rounds, config, depths)
+    # At full size each view is on its own again: errors that views hand to each other would pass the filter together.
+    found = _finer(found, full, config.rounds, config)
     h, w = found.planes.shape[:2]
     return _depth_map(found.planes, cv2.resize(found.margin, (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def estimate_depth(reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None) -> DepthMap:
+    """Depth of one view alone, before any filter: both passes, without the sources' own depth.
+
+    Parameters and errors as of `sweep_depth`.
+    """
+    return refine_depth(reference, sources, sweep_depth(reference, sources, near, far, config), (), config)
 
 
 def _resized(depth: Map, shape: tuple[int, ...]) -> Map:
@@ -236,7 +245,7 @@ def _depth_map(planes: Map, margin: Map) -> DepthMap:
     inverse, cost = planes[..., 0], planes[..., 3]
     depth = np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
     # ZNCC as likelihood, lifted where the aggregation found a clear winner.
-    confidence = np.clip(1.0 - cost, 0.02, 1.0) * (0.5 + 0.5 * np.clip(4 * margin, 0, 1))
+    confidence = np.clip((1.0 - cost) * (0.5 + 0.5 * np.clip(4 * margin, 0, 1)), LEAST_CONFIDENCE, 1.0)
     return DepthMap(depth, confidence.astype(np.float32))
 
 
@@ -246,12 +255,11 @@ def filter_depth(
     """Depth of view ``index`` that other views agree with, and by how many: the dynamic rule of D2HC-RMVSNet."""
     config = config or DepthConfig()
     mine, camera = depths[index], cameras[index]
-    sure = np.where(mine.confidence > (1 - config.max_cost) * 0.5, mine.depth, np.float32(0))
     others = list(others)[:32]
     there = np.array([relative_map(camera, cameras[j]) for j in others], np.float32).reshape(-1, 12)
     back = np.array([relative_map(cameras[j], camera) for j in others], np.float32).reshape(-1, 12)
     kept, support = _core.consistency(
-        np.ascontiguousarray(sure),
+        mine.depth,
         [depths[j].depth for j in others],
         there,
         back,
@@ -301,7 +309,7 @@ def disparity(
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
     other = theirs[:, ::-1, 0]
     d = mine[..., 0]
-    h, w = d.shape
+    _h, w = d.shape
     x = np.arange(w)[None] - d
     near = np.clip(np.rint(x).astype(int), 0, w - 1)
     seen = (np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5)

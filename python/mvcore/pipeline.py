@@ -146,7 +146,7 @@ def reconstruct(
         views = [d if d is not None else _nothing(c) for d, c in zip(filtered, cameras, strict=True)]
         volume = fuse(views, cameras, box, cut, config.volume, report)
     with clock.stage("surface"):
-        surface = extract_surface(volume, config.surface)
+        surface = extract_surface(volume, config.surface, solid=cut is not None)
     with clock.stage("texture"):
         textured = texture(surface, images, cameras, cut, volume.voxel, config.texture, report, track)
     report.values["mesh"] = {"vertices": len(textured.vertices), "faces": len(textured.faces)}
@@ -198,9 +198,7 @@ def _depths(
     depths: list[DepthMap | None] = [None] * len(views)
     for n in track(used, "depth, second pass", len(used)):
         others = [j for j in sources[n] if j in rough]
-        depths[n] = depth_stage.refine_depth(
-            views[n], [views[j] for j in others], rough[n], [rough[j] for j in others], config.depth
-        )
+        depths[n] = depth_stage.refine_depth(views[n], [views[j] for j in others], rough[n], [rough[j] for j in others], config.depth)
     return depths
 
 

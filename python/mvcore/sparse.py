@@ -131,7 +131,9 @@ def calibration_error(
     return median(everything), [median(parts) for parts in by_view]
 
 
-def check_calibration(overall: float | None, by_view: Sequence[float | None], cameras: Sequence[Camera], config: SparseConfig, report: Report) -> None:
+def check_calibration(
+    overall: float | None, by_view: Sequence[float | None], cameras: Sequence[Camera], config: SparseConfig, report: Report
+) -> None:
     """Warn above ``warn_error`` pixels, raise above ``fail_error``, naming the views that are off."""
     report.values["calibration"] = {"median_epipolar_error_px": overall, "by_view_px": list(by_view)}
     if overall is None:
@@ -141,7 +143,11 @@ def check_calibration(overall: float | None, by_view: Sequence[float | None], ca
     worst = ", ".join(f"view {n} ({cameras[n].name or 'unnamed'}) {e:.1f} px" for e, n in sorted(off, reverse=True)[:5])
     if overall > config.fail_error:
         some = len(off) < 0.7 * len(by_view)
-        why = "the poses of these views" if some else "the pose convention (world-to-camera or camera-to-world, axes), the intrinsics or the image order"
+        why = (
+            "the poses of these views"
+            if some
+            else "the pose convention (world-to-camera or camera-to-world, axes), the intrinsics or the image order"
+        )
         raise ReconstructionError(
             f"the calibration does not fit the images: the median epipolar error is {overall:.1f} px (at most "
             f"{config.fail_error:g} px); look at {why}: {worst}"
@@ -402,7 +408,7 @@ def hull_box(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]], arou
             x = np.clip(x, 0, [camera.width - 1, camera.height - 1])
             seen[visible] += 1
             inside[visible] += grown[x[:, 1], x[:, 0]] > 0
-        hull = grid[(seen >= 2) & (inside >= 0.95 * seen)]
+        hull = grid[(seen >= max(2, 0.5 * len(cameras))) & (inside >= 0.95 * seen)]
         if not len(hull):
             return box
         box = np.stack([hull.min(0) - cell, hull.max(0) + cell])

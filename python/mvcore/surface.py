@@ -54,8 +54,10 @@ def isosurface(volume: Volume) -> Surface:
     return Surface(volume.origin + volume.voxel * vertices.astype(np.float64), faces)
 
 
-def extract_surface(volume: Volume, config: SurfaceConfig | None = None) -> Surface:
+def extract_surface(volume: Volume, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
     """Isosurface, small parts dropped, then smoothed and decimated as configured.
+
+    ``solid`` says that the field is closed (silhouettes were given): bubbles inside it are dropped too.
 
     Raises
     ------
@@ -66,6 +68,8 @@ def extract_surface(volume: Volume, config: SurfaceConfig | None = None) -> Surf
     surface = isosurface(volume)
     if not len(surface.faces):
         raise ReconstructionError("the depth maps agree on no surface inside the bounds")
+    if solid:
+        surface = drop_cavities(surface)
     surface = drop_small_parts(surface, config.min_component)
     if config.smooth:
         surface = smooth(surface, config.smooth)
@@ -88,6 +92,14 @@ def drop_small_parts(surface: Surface, share: float) -> Surface:
     part = _core.components(surface.faces)
     size = np.bincount(part)
     return _compact(surface.vertices, surface.faces[size[part] >= share * size.max()])
+
+
+def drop_cavities(surface: Surface) -> Surface:
+    """Drops closed parts that face inward (their signed volume is negative): no photograph sees into a bubble."""
+    part = _core.components(surface.faces)
+    a, b, c = (surface.vertices[surface.faces[:, k]] - surface.vertices.mean(0) for k in range(3))
+    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    return _compact(surface.vertices, surface.faces[volume[part] > 0])
 
 
 def smooth(surface: Surface, rounds: int) -> Surface:

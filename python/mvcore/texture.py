@@ -133,9 +133,7 @@ def _build(
             pictures.append(np.ascontiguousarray(image))
             scaled.append(np.ascontiguousarray(camera.projection))
         try:
-            origin, texel, new_faces, atlas = _core.build_atlas(
-                vertices, faces, labels, pictures, scaled, gains.tolist(), config.max_size
-            )
+            origin, texel, new_faces, atlas = _core.build_atlas(vertices, faces, labels, pictures, scaled, gains.tolist(), config.max_size)
             break
         except InvalidInputError:
             if scale < 0.05:
@@ -148,7 +146,7 @@ def _build(
     report.values["texture"] = {
         "atlas": [width, height],
         "unseen_faces": int((labels < 0).sum()),
-        "views_used": int(len(np.unique(labels[labels >= 0]))),
+        "views_used": len(np.unique(labels[labels >= 0])),
         "scale": scale,
     }
     return TexturedSurface(vertices[origin], new_faces, uv, atlas, labels)

@@ -25,7 +25,8 @@ Bounds = NDArray[np.float64]
 class Track(Protocol):
     """Wraps an iterable to show progress: ``track(items, "depth maps", total)``; the library itself never prints."""
 
-    def __call__(self, items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]: ...
+    def __call__(self, items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
+        """The items again, one by one."""
 
 
 def no_track(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:

@@ -112,6 +112,7 @@ def fuse(
                 truncation=config.truncation * voxel,
                 free_weight=config.free_weight,
                 min_weight=config.min_weight,
+                solid_weight=config.solid_weight,
                 hull_tolerance=config.hull_tolerance,
                 max_memory=config.max_memory,
             )

@@ -78,9 +78,7 @@ def load_frame(frame: Frame, camera: Camera, index: int) -> Image:
     require(image.ndim == 3 and image.shape[2] == 3, name, "shape (h, w, 3)", image.shape)
     size = (image.shape[1], image.shape[0])
     if size != (camera.width, camera.height):
-        raise InvalidInputError(
-            f"{name}: expected {camera.width} x {camera.height} pixels as its camera, got {size[0]} x {size[1]}"
-        )
+        raise InvalidInputError(f"{name}: expected {camera.width} x {camera.height} pixels as its camera, got {size[0]} x {size[1]}")
     return np.ascontiguousarray(image)
 
 
@@ -91,7 +89,12 @@ def load_mask(mask: Frame, camera: Camera, index: int) -> NDArray[np.uint8]:
         array = read_mask(mask)
     else:
         given = np.asarray(mask)
-        require(given.ndim == 2 and given.dtype in (np.uint8, np.bool_), name, "(h, w) of uint8 or bool", f"{given.shape} of {given.dtype}")
+        require(
+            given.ndim == 2 and given.dtype in (np.uint8, np.bool_),
+            name,
+            "(h, w) of uint8 or bool",
+            f"{given.shape} of {given.dtype}",
+        )
         array = np.where(given > (0 if given.dtype == np.bool_ or given.max(initial=0) <= 1 else 127), 255, 0).astype(np.uint8)
     require(array.shape == (camera.height, camera.width), name, f"shape {(camera.height, camera.width)}", array.shape)
     return array

@@ -52,9 +52,7 @@ def _view(folder: Path, path: Path) -> Record:
         raise lines.fail(words[9], "expected 'DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM DEPTH_MAX]'")
     stem = path.name.removesuffix("_cam.txt")
     image = _image(folder, stem)
-    return Record(
-        K=matrix, R=pose[:3, :3], t=pose[:3, 3], image=image or folder / "images" / f"{stem}.jpg", name=stem, line=words[0]
-    )
+    return Record(K=matrix, R=pose[:3, :3], t=pose[:3, 3], image=image or folder / "images" / f"{stem}.jpg", name=stem, line=words[0])
 
 
 def _image(folder: Path, stem: str) -> Path | None:

@@ -137,9 +137,7 @@ def _with_size(record: Record, where: str, need_images: bool) -> Record:
         return record
     width, height = image_size(record.image)
     if record.width and (width, height) != (record.width, record.height):
-        raise FormatError(
-            f"{where}: image {record.image.name} has {width} x {height} pixels, its camera {record.width} x {record.height}"
-        )
+        raise FormatError(f"{where}: image {record.image.name} has {width} x {height} pixels, its camera {record.width} x {record.height}")
     return replace(record, width=width, height=height)
 
 

@@ -30,6 +30,4 @@ def _view(folder: Path, path: Path) -> Record:
     width, height = lines.numbers(9, 2)
     name = path.name.removesuffix(".camera")
     image = image_in(folder, name) or image_in(folder.parent, name) or folder / name
-    return Record(
-        K=k, R=rotation, t=-rotation @ center, width=int(width), height=int(height), image=image, name=name, line=1
-    )
+    return Record(K=k, R=rotation, t=-rotation @ center, width=int(width), height=int(height), image=image, name=name, line=1)

@@ -79,9 +79,7 @@ def _native(path: Path, scene: Scene) -> None:
         if camera.distortion.size:
             view |= {"dist": camera.distortion.tolist(), "fisheye": camera.fisheye}
         views.append(view)
-    data: dict[str, Any] = {
-        "convention": "x ~ K (R X + t); OpenCV axes (x right, y down, z forward); pixel centres at integer coordinates"
-    }
+    data: dict[str, Any] = {"convention": "x ~ K (R X + t); OpenCV axes (x right, y down, z forward); pixel centres at integer coordinates"}
     if scene.bounds is not None:
         data["bounds"] = np.asarray(scene.bounds).tolist()
     _text(path, json.dumps(data | {"views": views}, indent=1) + "\n")
@@ -115,7 +113,10 @@ def _in_folder(path: Path, fill: Callable[[Path], None]) -> None:
 
 def _colmap(path: Path, scene: Scene) -> None:
     def fill(folder: Path) -> None:
-        cameras, images = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then points"]
+        cameras, images = (
+            ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS"],
+            ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then points"],
+        )
         for n, (camera, name) in enumerate(zip(scene.calib, _short_names(scene), strict=True), 1):
             cameras.append(f"{n} {_colmap_camera(camera)}")
             pose = [*rotation_to_quaternion(camera.R), *camera.t]
@@ -139,7 +140,12 @@ def _short_names(scene: Scene) -> list[str]:
 
 def _mvsnet(path: Path, scene: Scene) -> None:
     for camera in scene.calib:
-        require(not camera.distortion.size, f"camera {camera.name!r}", "no distortion (MVSNet files hold none)", camera.distortion.tolist())
+        require(
+            not camera.distortion.size,
+            f"camera {camera.name!r}",
+            "no distortion (MVSNet files hold none)",
+            camera.distortion.tolist(),
+        )
     ranges = _depth_ranges(scene.calib, scene.bounds)
     pairs = _pairs(scene.calib)
 

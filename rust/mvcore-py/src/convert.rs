@@ -3,7 +3,7 @@
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::{Error, Result};
 use ndarray::{Array, Dimension, IntoDimension};
-use numpy::{Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2};
+use numpy::{Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyAnyMethods;
@@ -28,17 +28,14 @@ pub fn slice<'a, T: Element, D: Dimension>(
     array: &'a PyReadonlyArray<'_, T, D>,
     argument: &'static str,
 ) -> PyResult<&'a [T]> {
-    array.as_slice().map_err(|_| PyValueError::new_err(format!("{argument}: expected a C-contiguous array")))
+    let values = array.as_slice().ok().filter(|_| array.is_c_contiguous());
+    values.ok_or_else(|| PyValueError::new_err(format!("{argument}: expected a C-contiguous array")))
 }
 
 /// A 2-D array as a raster.
-pub fn raster<'a, T: Element>(
-    array: &'a PyReadonlyArray2<'_, T>,
-    argument: &'static str,
-) -> PyResult<Raster<'a, T>> {
+pub fn raster<'a, T: Element>(array: &'a PyReadonlyArray2<'_, T>, argument: &'static str) -> PyResult<Raster<'a, T>> {
     let shape = array.as_array().dim();
-    Raster::new(slice(array, argument)?, shape.1, shape.0, argument)
-        .map_err(|error| to_python(array.py(), &error))
+    Raster::new(slice(array, argument)?, shape.1, shape.0, argument).map_err(|error| to_python(array.py(), &error))
 }
 
 /// A list of 2-D arrays as rasters.

@@ -65,10 +65,8 @@ pub fn refine<'py>(
         .zip(map_of(&backs, depths.len(), "backs")?)
         .map(|(depth, back)| SourceSurface { depth, back })
         .collect();
-    let init: Vec<Hypothesis> = slice(&init, "init")?
-        .chunks_exact(4)
-        .map(|h| Hypothesis { w: h[0], a: h[1], b: h[2], cost: h[3] })
-        .collect();
+    let init: Vec<Hypothesis> =
+        slice(&init, "init")?.chunks_exact(4).map(|h| Hypothesis { w: h[0], a: h[1], b: h[2], cost: h[3] }).collect();
     let prior = slice(&prior, "prior")?;
     let params =
         RefineParams { iterations, range: (low, high), step, max_slope, prior_weight, prior_reach, geometry_weight };

@@ -154,7 +154,8 @@ impl Split {
         let chart = |&(low, high, view): &([f64; 2], [f64; 2], i32)| {
             (view != NOTHING).then(|| {
                 let from = low.map(|v| v.floor() as i64 - PADDING);
-                let size: [usize; 2] = std::array::from_fn(|k| (high[k].ceil() as i64 + PADDING + 1 - from[k]) as usize);
+                let size: [usize; 2] =
+                    std::array::from_fn(|k| (high[k].ceil() as i64 + PADDING + 1 - from[k]) as usize);
                 Chart { view: view as usize, from: (from[0], from[1]), size: (size[0], size[1]), to: (0, 0) }
             })
         };
@@ -166,10 +167,7 @@ impl Split {
         for (v, texel) in out.texel.iter_mut().enumerate() {
             if let Some(c) = charts[self.part[v] as usize] {
                 let [x, y] = self.pixel[v];
-                *texel = [
-                    (x - c.from.0 as f64 + c.to.0 as f64) as f32,
-                    (y - c.from.1 as f64 + c.to.1 as f64) as f32,
-                ];
+                *texel = [(x - c.from.0 as f64 + c.to.0 as f64) as f32, (y - c.from.1 as f64 + c.to.1 as f64) as f32];
             }
         }
     }
@@ -258,9 +256,8 @@ fn solve(n: usize, links: &[(u32, u32, f64)], target: &[[f64; 3]]) -> Vec<[f64; 
         a.iter().zip(b).for_each(|(p, q)| (0..3).for_each(|k| s[k] += p[k] * q[k]));
         s
     };
-    let precondition = |r: &[[f64; 3]]| -> Vec<[f64; 3]> {
-        r.iter().zip(&diagonal).map(|(r, d)| r.map(|v| v / d)).collect()
-    };
+    let precondition =
+        |r: &[[f64; 3]]| -> Vec<[f64; 3]> { r.iter().zip(&diagonal).map(|(r, d)| r.map(|v| v / d)).collect() };
     let mut x = vec![[0.0; 3]; n];
     let mut r = target.to_vec();
     let mut z = precondition(&r);
@@ -361,7 +358,9 @@ fn paint(
     let painted: Vec<Vec<u8>> = charts
         .par_iter()
         .zip(&members)
-        .map(|(chart, faces)| chart.map_or_else(Vec::new, |c| paint_chart(&c, faces, split, texel, corrections, sources)))
+        .map(|(chart, faces)| {
+            chart.map_or_else(Vec::new, |c| paint_chart(&c, faces, split, texel, corrections, sources))
+        })
         .collect();
     for (chart, pixels) in charts.iter().zip(&painted).filter_map(|(c, p)| c.as_ref().map(|c| (c, p))) {
         for y in 0..chart.size.1 {
@@ -523,8 +522,7 @@ fn fill_colours(
         let before = colour.clone();
         for &f in unseen {
             let face = mesh.faces[f as usize];
-            let from: Vec<[f32; 3]> =
-                face.iter().map(|&v| before[v as usize]).filter(|c| !c[0].is_nan()).collect();
+            let from: Vec<[f32; 3]> = face.iter().map(|&v| before[v as usize]).filter(|c| !c[0].is_nan()).collect();
             for &v in face.iter().filter(|_| !from.is_empty()) {
                 if colour[v as usize][0].is_nan() {
                     colour[v as usize] =

@@ -5,7 +5,9 @@
 //! ```
 //!
 //! The dynamic rule of D2HC-RMVSNet (Yan et al., ECCV 2020): keep if for some n at least n views agree within n times the unit
-//! tolerances; the depth becomes the mean over the agreeing views.
+//! tolerances; the depth becomes the mean over the agreeing views. Sparse rigs have few witnesses to a point: there it is also
+//! kept if at least half of the views that could see it agree within three times the unit tolerances. A view whose surface stands
+//! before the point could not see it; one that looks through the point to something farther could, and disagrees.
 
 use crate::error::{Result, require};
 use crate::raster::{Epipolar, Raster};
@@ -34,6 +36,10 @@ pub struct ConsistencyParams {
 }
 
 const MAX_VIEWS: usize = 32;
+/// Units of tolerance within which a majority of the witnesses must agree.
+const MAJORITY: f32 = 3.0;
+/// Relative depth by which a surface must stand before a point to hide it.
+const HIDING: f32 = 0.01;
 const LARGEST_N: usize = 10;
 
 /// Filtered depth (0 where inconsistent) and the number of agreeing views, each (h, w).
@@ -59,35 +65,42 @@ pub fn consistency(
 
 fn judge(x: f32, y: f32, z: f32, others: &[OtherView], params: &ConsistencyParams) -> (f32, u8) {
     let mut votes = [(f32::MAX, 0.0f32); MAX_VIEWS];
-    let mut seen = 0;
+    let mut witnesses = 0;
     for other in others {
-        if let Some((pixels, back)) = round_trip(x, y, z, other) {
-            let strictness = (pixels / params.pixel_unit).max((back - z).abs() / (z * params.depth_unit));
-            votes[seen] = (strictness, back);
-            seen += 1;
+        if let Some(trip) = round_trip(x, y, z, other).filter(|trip| !trip.hidden) {
+            let strictness = (trip.pixels / params.pixel_unit).max((trip.depth - z).abs() / (z * params.depth_unit));
+            votes[witnesses] = (strictness, trip.depth);
+            witnesses += 1;
         }
     }
-    let mut accepted = None;
-    for n in params.min_views..=LARGEST_N.max(params.min_views) {
-        if votes[..seen].iter().filter(|v| v.0 < n as f32).count() >= n {
-            accepted = Some(n as f32);
-        }
-    }
-    let Some(n) = accepted else { return (0.0, 0) };
+    let agreeing = |n: f32| votes[..witnesses].iter().filter(|v| v.0 < n).count();
+    let most = LARGEST_N.max(params.min_views);
+    let by_rule = (params.min_views..=most).rev().find(|&n| agreeing(n as f32) >= n).map(|n| n as f32);
+    let majority = agreeing(MAJORITY) >= params.min_views && 2 * agreeing(MAJORITY) >= witnesses;
+    let Some(n) = by_rule.or(majority.then_some(MAJORITY)) else { return (0.0, 0) };
     let (mut sum, mut count) = (z, 1.0);
-    for (_, back) in votes[..seen].iter().filter(|v| v.0 < n) {
+    for (_, back) in votes[..witnesses].iter().filter(|v| v.0 < n) {
         sum += back;
         count += 1.0;
     }
     (sum / count, (count - 1.0) as u8)
 }
 
-/// Reprojection error in pixels and the depth with which the other view's surface comes back.
-fn round_trip(x: f32, y: f32, z: f32, other: &OtherView) -> Option<(f32, f32)> {
-    let (u, v, _) = project(&other.there, x, y, z)?;
+/// What comes back from another view.
+struct Trip {
+    /// Reprojection error.
+    pixels: f32,
+    /// Depth in the reference view.
+    depth: f32,
+    /// The other view's surface stands before the point.
+    hidden: bool,
+}
+
+fn round_trip(x: f32, y: f32, z: f32, other: &OtherView) -> Option<Trip> {
+    let (u, v, expected) = project(&other.there, x, y, z)?;
     let there = sample(&other.depth, u, v)?;
-    let (bx, by, back) = project(&other.back, u, v, there)?;
-    Some(((bx - x).hypot(by - y), back))
+    let (bx, by, depth) = project(&other.back, u, v, there)?;
+    Some(Trip { pixels: (bx - x).hypot(by - y), depth, hidden: there < expected * (1.0 - HIDING) })
 }
 
 fn project(map: &Epipolar, x: f32, y: f32, z: f32) -> Option<(f32, f32, f32)> {
@@ -141,6 +154,23 @@ mod tests {
         let (kept, support) = consistency(raster(&mine), &[other(1.0), other(-1.0)], &PARAMS).unwrap();
         assert_eq!(kept[5 * w + 20], 0.0);
         assert_eq!((kept[5 * w + 15], support[5 * w + 15]), (10.0, 2));
+    }
+
+    #[test]
+    fn a_majority_of_few_witnesses_is_enough_and_one_that_looks_through_is_against() {
+        let (w, h) = (40, 10);
+        let depth = |z: f32| vec![z; w * h];
+        let raster = |d| Raster::new(d, w, h, "depth").unwrap();
+        let (mine, near, far) = (depth(10.0), depth(10.05), depth(14.0));
+        let other = |d, s| {
+            let (there, back) = views(s);
+            OtherView { depth: raster(d), there, back }
+        };
+        let params = ConsistencyParams { min_views: 1, pixel_unit: 0.25, depth_unit: 1.0 / 300.0 };
+        let kept = |others: &[OtherView]| consistency(raster(&mine), others, &params).unwrap().0[5 * w + 20] > 0.0;
+        assert!(kept(&[other(&near, 0.2)]));
+        assert!(kept(&[other(&near, 0.2), other(&far, 0.2)]));
+        assert!(!kept(&[other(&near, 0.2), other(&far, 0.2), other(&far, -0.2)]));
     }
 
     #[test]

@@ -11,24 +11,11 @@
 use std::sync::LazyLock;
 
 /// The two corners of each edge; edges 0-3 run along x, 4-7 along y, 8-11 along z. The first corner is the lower one.
-pub const EDGES: [(usize, usize); 12] = [
-    (0, 4),
-    (1, 5),
-    (2, 6),
-    (3, 7),
-    (0, 2),
-    (1, 3),
-    (4, 6),
-    (5, 7),
-    (0, 1),
-    (2, 3),
-    (4, 5),
-    (6, 7),
-];
+pub const EDGES: [(usize, usize); 12] =
+    [(0, 4), (1, 5), (2, 6), (3, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 1), (2, 3), (4, 5), (6, 7)];
 
 /// Corners of each face, counter-clockwise seen from outside the cell.
-const FACES: [[usize; 4]; 6] =
-    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
+const FACES: [[usize; 4]; 6] = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
 
 /// For each of the 256 cases the triangles as triples of edges, counter-clockwise seen from outside the surface.
 pub static TRIANGLES: LazyLock<Vec<Vec<[u8; 3]>>> = LazyLock::new(|| (0..256).map(triangles).collect());

@@ -38,8 +38,10 @@ pub struct FusionParams {
     pub truncation: f64,
     /// Weight of a free-space observation relative to a surface one.
     pub free_weight: f32,
-    /// Weight below which a voxel counts as unobserved.
+    /// Weight of surface observations below which a voxel is not inside; free space needs none.
     pub min_weight: f32,
+    /// Free-space weight that carves the inside of the hull where no surface was seen.
+    pub solid_weight: f32,
     /// Share of the silhouettes that see a voxel and may disagree with its being inside.
     pub hull_tolerance: f32,
     /// Most bytes of the volume.
@@ -64,7 +66,12 @@ pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<V
     require(params.truncation > 0.0, "truncation", "a positive distance", params.truncation)?;
     for view in views {
         let same = view.weight.width == view.depth.width && view.weight.height == view.depth.height;
-        require(same, "weight", "the size of the depth map", format!("{} x {}", view.weight.height, view.weight.width))?;
+        require(
+            same,
+            "weight",
+            "the size of the depth map",
+            format!("{} x {}", view.weight.height, view.weight.width),
+        )?;
     }
     let dims = grid.blocks();
     let count = dims.iter().product::<usize>();
@@ -160,9 +167,10 @@ const MAX_SILHOUETTES: usize = 256;
 /// Signed distance to the visual hull (positive outside), to first order near its surface; the views' vote.
 fn hull_distance(p: [f64; 3], views: &[FusionView], tolerance: f32) -> f32 {
     let mut outside = [f32::MIN; MAX_SILHOUETTES];
-    let mut seen = 0;
+    let (mut seen, mut silhouettes) = (0, 0);
     for view in views.iter().take(MAX_SILHOUETTES) {
         let Some(silhouette) = &view.silhouette else { continue };
+        silhouettes += 1;
         let m = &view.projection;
         let q: [f64; 3] =
             std::array::from_fn(|r| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
@@ -178,12 +186,12 @@ fn hull_distance(p: [f64; 3], views: &[FusionView], tolerance: f32) -> f32 {
         let (x1, y1) = ((x + 1).min(silhouette.width - 1), (y + 1).min(silhouette.height - 1));
         let (a, b) = ((u - x as f64) as f32, (v - y as f64) as f32);
         let at = |x: usize, y: usize| silhouette.data[y * silhouette.width + x];
-        let pixels =
-            (1.0 - b) * ((1.0 - a) * at(x, y) + a * at(x1, y)) + b * ((1.0 - a) * at(x, y1) + a * at(x1, y1));
+        let pixels = (1.0 - b) * ((1.0 - a) * at(x, y) + a * at(x1, y)) + b * ((1.0 - a) * at(x, y1) + a * at(x1, y1));
         outside[seen] = pixels * (q[2] / view.focal) as f32;
         seen += 1;
     }
-    if seen == 0 {
+    // What few views see, few silhouettes can cut: it does not belong to a target that the rig looks at.
+    if seen == 0 || 2 * seen < silhouettes {
         return f32::MAX;
     }
     let allowed = ((seen as f32 * tolerance) as usize).min(seen - 1);
@@ -201,8 +209,7 @@ struct Stepper {
 
 impl Stepper {
     fn new(grid: &Grid, at: [u32; 3], m: &[f64; 12]) -> Self {
-        let p: [f64; 3] =
-            std::array::from_fn(|a| grid.origin[a] + grid.voxel * f64::from(at[a]) * SIDE as f64);
+        let p: [f64; 3] = std::array::from_fn(|a| grid.origin[a] + grid.voxel * f64::from(at[a]) * SIDE as f64);
         let row = |r: usize| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3];
         let column = |c: usize| std::array::from_fn(|r| (m[4 * r + c] * grid.voxel) as f32);
         Self { base: std::array::from_fn(|r| row(r) as f32), di: column(0), dj: column(1), dk: column(2) }
@@ -229,31 +236,34 @@ impl Stepper {
     "x86_64+avx2+fma+bmi2",
     "aarch64+neon"
 ))]
-fn integrate(
-    grid: &Grid,
-    at: [u32; 3],
-    views: &[FusionView],
-    params: &FusionParams,
-    masked: bool,
-    out: &mut [f32],
-) {
+fn integrate(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionParams, masked: bool, out: &mut [f32]) {
     let inverse_truncation = (1.0 / params.truncation) as f32;
     let mut sum = [0.0f32; BLOCK];
     let mut total = [0.0f32; BLOCK];
+    let mut near = [0.0f32; BLOCK];
     for view in views {
         let stepper = Stepper::new(grid, at, &view.projection);
         if stepper.misses(view.depth.width, view.depth.height) {
             continue;
         }
-        for (row, (sum, total)) in
-            sum.as_chunks_mut::<SIDE>().0.iter_mut().zip(total.as_chunks_mut::<SIDE>().0).enumerate()
-        {
+        let rows = sum.as_chunks_mut::<SIDE>().0.iter_mut();
+        let rows = rows.zip(total.as_chunks_mut::<SIDE>().0).zip(near.as_chunks_mut::<SIDE>().0);
+        for (row, ((sum, total), near)) in rows.enumerate() {
             let (i, j) = ((row / SIDE) as f32, (row % SIDE) as f32);
-            add_row(view, &stepper, i, j, inverse_truncation, params.free_weight, sum, total);
+            add_row(view, &stepper, i, j, inverse_truncation, params.free_weight, sum, total, near);
         }
     }
-    for (v, (s, t)) in out.iter_mut().zip(sum.iter().zip(&total)) {
-        *v = if *t > params.min_weight { s / t } else if masked { -1.0 } else { f32::NAN };
+    for n in 0..BLOCK {
+        let mean = sum[n] / total[n].max(1e-12);
+        // Where no surface was seen, one view that looks through must not carve the solid inside of the hull.
+        let carved = total[n] > if masked { params.solid_weight } else { 0.0 } && mean >= 0.0;
+        out[n] = if total[n] > 0.0 && (near[n] >= params.min_weight.max(f32::MIN_POSITIVE) || carved) {
+            mean
+        } else if masked {
+            -1.0
+        } else {
+            f32::NAN
+        };
     }
     if masked {
         cut_by_hull(grid, at, views, params, out);
@@ -270,6 +280,7 @@ fn add_row(
     free_weight: f32,
     sum: &mut [f32; SIDE],
     total: &mut [f32; SIDE],
+    near: &mut [f32; SIDE],
 ) {
     let base: [f32; 3] = std::array::from_fn(|r| stepper.base[r] + i * stepper.di[r] + j * stepper.dj[r]);
     let (mut u, mut v, mut z) = ([0.0f32; SIDE], [0.0f32; SIDE], [0.0f32; SIDE]);
@@ -295,8 +306,9 @@ fn add_row(
         } else {
             weight[k]
         };
-        sum[k] += w * distance.min(1.0).max(-1.0);
+        sum[k] += w * distance.clamp(-1.0, 1.0);
         total[k] += w;
+        near[k] += if distance <= 1.0 { w } else { 0.0 };
     }
 }
 
@@ -331,9 +343,8 @@ fn cut_by_hull(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionP
     let inverse = (1.0 / params.truncation) as f32;
     for (n, v) in out.iter_mut().enumerate() {
         let local = [n / (SIDE * SIDE), n / SIDE % SIDE, n % SIDE];
-        let p = std::array::from_fn(|a| {
-            grid.origin[a] + grid.voxel * (f64::from(at[a]) * SIDE as f64 + local[a] as f64)
-        });
+        let p =
+            std::array::from_fn(|a| grid.origin[a] + grid.voxel * (f64::from(at[a]) * SIDE as f64 + local[a] as f64));
         let hull = hull_distance(p, views, params.hull_tolerance);
         *v = v.max((hull * inverse).clamp(-1.0, 1.0));
     }
@@ -348,8 +359,14 @@ mod tests {
         [60., 0., 31.5, 126., 0., 60., 31.5, 126., 0., 0., 1., 4.]
     }
 
-    const PARAMS: FusionParams =
-        FusionParams { truncation: 0.2, free_weight: 1.0, min_weight: 0.0, hull_tolerance: 0.0, max_memory: 1 << 30 };
+    const PARAMS: FusionParams = FusionParams {
+        truncation: 0.2,
+        free_weight: 1.0,
+        min_weight: 0.0,
+        solid_weight: 0.5,
+        hull_tolerance: 0.0,
+        max_memory: 1 << 30,
+    };
 
     fn grid() -> Grid {
         Grid::new([-1.0, -1.0, -1.0], 0.05, [41, 41, 41]).unwrap()

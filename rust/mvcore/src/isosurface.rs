@@ -187,8 +187,7 @@ fn extract<S: Samples>(map: &BlockMap, samples: &S) -> Surface {
             Block { sign, valid, ..Block::default() }
         })
         .collect();
-    let counted: Vec<(Block, u32, u32)> =
-        map.coords.par_iter().map(|&at| count(&around(map, &blocks, at))).collect();
+    let counted: Vec<(Block, u32, u32)> = map.coords.par_iter().map(|&at| count(&around(map, &blocks, at))).collect();
     let (mut vertices, mut faces, mut partial) = (0u32, 0u32, false);
     for (block, (mut found, v, f)) in blocks.iter_mut().zip(counted) {
         (found.vertex, found.face) = (vertices, faces);
@@ -405,7 +404,8 @@ mod tests {
         let (mut area, mut volume, mut least) = (0.0, 0.0, f64::MAX);
         for f in &s.faces {
             let [a, b, c] = f.map(|v| s.vertices[v as usize].map(f64::from));
-            let (u, v): ([f64; 3], [f64; 3]) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
+            let (u, v): ([f64; 3], [f64; 3]) =
+                (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
             let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
             let twice = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
             area += twice / 2.0;

@@ -37,7 +37,8 @@ pub fn match_epipolar(
     let f = fundamental;
     let transposed = [f[0], f[3], f[6], f[1], f[4], f[7], f[2], f[5], f[8]];
     let (there, back) = rayon::join(|| best(a, b, fundamental, band, ratio), || best(b, a, &transposed, band, ratio));
-    let mutual = |(i, m): (usize, &Option<u32>)| m.filter(|&j| back[j as usize] == Some(i as u32)).map(|j| [i as u32, j]);
+    let mutual =
+        |(i, m): (usize, &Option<u32>)| m.filter(|&j| back[j as usize] == Some(i as u32)).map(|j| [i as u32, j]);
     Ok(there.iter().enumerate().filter_map(mutual).collect())
 }
 
@@ -48,11 +49,7 @@ fn best(a: Features, b: Features, fundamental: &[f64; 9], band: f32, ratio: f32)
         .collect()
 }
 
-#[multiversion(targets(
-    "x86_64+avx512f+avx512bw+avx512vl+avx2+fma+bmi2",
-    "x86_64+avx2+fma+bmi2",
-    "aarch64+neon"
-))]
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl+avx2+fma+bmi2", "x86_64+avx2+fma+bmi2", "aarch64+neon"))]
 fn best_of_one(
     position: [f32; 2],
     descriptor: &[u8; DESCRIPTOR],

@@ -49,7 +49,8 @@ impl<'a> Mesh<'a> {
 /// Pixel and z-depth of a world point under P = K [R | t] (row-major 3x4).
 #[inline(always)]
 pub fn project(m: &[f64; 12], p: [f64; 3]) -> [f64; 3] {
-    let q: [f64; 3] = std::array::from_fn(|r| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
+    let q: [f64; 3] =
+        std::array::from_fn(|r| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
     [q[0] / q[2], q[1] / q[2], q[2]]
 }
 

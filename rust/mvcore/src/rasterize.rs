@@ -31,12 +31,8 @@ pub fn rasterize(mesh: Mesh, projection: &[f64; 12], width: usize, height: usize
         }
     }
     let (mut depth, mut hit) = (vec![0.0f32; width * height], vec![NOTHING; width * height]);
-    depth
-        .par_chunks_mut(BAND * width)
-        .zip(hit.par_chunks_mut(BAND * width))
-        .zip(&lists)
-        .enumerate()
-        .for_each(|(band, ((depth, hit), list))| {
+    depth.par_chunks_mut(BAND * width).zip(hit.par_chunks_mut(BAND * width)).zip(&lists).enumerate().for_each(
+        |(band, ((depth, hit), list))| {
             for &n in list {
                 let p = mesh.faces[n as usize].map(|v| points[v as usize]);
                 draw(p, width, band * BAND, depth.len() / width, |at, z| {
@@ -46,7 +42,8 @@ pub fn rasterize(mesh: Mesh, projection: &[f64; 12], width: usize, height: usize
                     }
                 });
             }
-        });
+        },
+    );
     Ok((depth, hit))
 }
 
@@ -97,7 +94,16 @@ mod tests {
             let (x, y) = ((i % 21) as f64 - 10.0, (i / 21) as f64 - 10.0);
             let near = x.abs() <= 5.0 && y.abs() <= 5.0;
             let far = y <= 20.0;
-            assert_eq!(z, if near { 2.0 } else if far { 4.0 } else { 0.0 });
+            assert_eq!(
+                z,
+                if near {
+                    2.0
+                } else if far {
+                    4.0
+                } else {
+                    0.0
+                }
+            );
             assert_eq!(f >= 2, near);
         }
     }

@@ -257,7 +257,7 @@ mod tests {
         let mesh = Mesh::new(&vertices, &faces).unwrap();
         let noisy = |f: usize, v: usize| {
             let better = (f < 40) == (v == 0);
-            rating(if better { 1.0 } else { 0.8 } + if (f * 7 + v) % 5 == 0 { 0.3 } else { 0.0 }, 100)
+            rating(if better { 1.0 } else { 0.8 } + if (f * 7 + v).is_multiple_of(5) { 0.3 } else { 0.0 }, 100)
         };
         let ratings: Vec<Vec<_>> = (0..2).map(|v| (0..80).map(|f| noisy(f, v)).collect()).collect();
         let labels = select_views(mesh, &ratings, &PARAMS).unwrap();
@@ -270,10 +270,8 @@ mod tests {
     fn an_occluder_is_outvoted_and_unseen_faces_have_no_view() {
         let (vertices, faces) = strip(3);
         let mesh = Mesh::new(&vertices, &faces).unwrap();
-        let mut ratings: Vec<_> = [(9.0, 250), (1.0, 100), (1.2, 104)]
-            .into_iter()
-            .map(|(q, grey)| vec![rating(q, grey); 6])
-            .collect();
+        let mut ratings: Vec<_> =
+            [(9.0, 250), (1.0, 100), (1.2, 104)].into_iter().map(|(q, grey)| vec![rating(q, grey); 6]).collect();
         for view in &mut ratings {
             view[5] = Rating::default();
         }

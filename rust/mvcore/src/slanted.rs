@@ -99,13 +99,12 @@ pub fn refine(
     let quads: Vec<_> = sources.iter().map(|(image, map)| (Quads::new(*image), *map)).collect();
     let scene = Scene { reference, sources: &quads, surfaces, prior, params, sums: sums_for_this_cpu() };
     let mut now = init.to_vec();
-    scene.each_pixel(&mut now, |_, view, h| Hypothesis { cost: scene.cost(view, h), ..h });
+    scene.each_pixel(&mut now, |_| true, |_, view, h| Hypothesis { cost: scene.cost(view, h), ..h });
     for iteration in 0..params.iterations {
         for colour in 0..2 {
             let before = now.clone();
-            scene.each_pixel(&mut now, |pixel, view, h| {
-                if (pixel.0 + pixel.1) % 2 == colour { scene.improve(&before, pixel, view, h, iteration) } else { h }
-            });
+            let mine = |(x, y): (usize, usize)| (x + y) % 2 == colour;
+            scene.each_pixel(&mut now, mine, |pixel, view, h| scene.improve(&before, pixel, view, h, iteration));
         }
     }
     Ok(now)
@@ -128,6 +127,8 @@ struct View {
     mean: f32,
     variance: f32,
     prior: f32,
+    /// Sources asked, as bits.
+    asked: u32,
 }
 
 /// Neighbours whose planes are tried; all of the other colour of the checkerboard.
@@ -137,20 +138,22 @@ impl Scene<'_> {
     fn each_pixel(
         &self,
         planes: &mut [Hypothesis],
-        f: impl Fn((usize, usize), &View, Hypothesis) -> Hypothesis + Sync,
+        chosen: impl Fn((usize, usize)) -> bool + Sync,
+        f: impl Fn((usize, usize), &mut View, Hypothesis) -> Hypothesis + Sync,
     ) {
         let width = self.reference.width;
         planes.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-            for (x, h) in row.iter_mut().enumerate() {
-                let view = self.view(x, y);
-                *h = f((x, y), &view, *h);
+            for (x, h) in row.iter_mut().enumerate().filter(|(x, _)| chosen((*x, y))) {
+                let mut view = self.view(x, y);
+                *h = f((x, y), &mut view, *h);
             }
         });
     }
 
     fn view(&self, x: usize, y: usize) -> View {
         let image = self.reference;
-        let centre = f32::from(image.data[y * image.width + x]);
+        let centre = image.data[y * image.width + x];
+        let (colour, space) = (&*COLOUR_WEIGHT, &*SPACE_WEIGHT);
         let mut window = Window { weight: [0.0; SAMPLES], weighted: [0.0; SAMPLES] };
         let (dx, dy, n) = (&OFFSETS.0, &OFFSETS.1, OFFSETS.2);
         let mut total = 0.0;
@@ -158,7 +161,7 @@ impl Scene<'_> {
             let u = (x as i32 + dx[i] as i32).clamp(0, image.width as i32 - 1) as usize;
             let v = (y as i32 + dy[i] as i32).clamp(0, image.height as i32 - 1) as usize;
             let grey = image.data[v * image.width + u];
-            let weight = colour_weight(grey.abs_diff(centre as u8)) * SPACE_WEIGHT[i];
+            let weight = colour[grey.abs_diff(centre) as usize] * space[i];
             window.weight[i] = weight;
             window.weighted[i] = f32::from(grey);
             total += weight;
@@ -172,7 +175,7 @@ impl Scene<'_> {
             square += window.weighted[i] * grey;
         }
         let variance = (square - mean * mean).max(0.0) + NOISE_VARIANCE;
-        View { window, x: x as f32, y: y as f32, mean, variance, prior: self.prior[y * image.width + x] }
+        View { window, x: x as f32, y: y as f32, mean, variance, prior: self.prior[y * image.width + x], asked: !0 }
     }
 
     /// Tries the neighbours' planes, then ever smaller changes of the best one.
@@ -180,10 +183,13 @@ impl Scene<'_> {
         &self,
         before: &[Hypothesis],
         (x, y): (usize, usize),
-        view: &View,
+        view: &mut View,
         mut best: Hypothesis,
         iteration: usize,
     ) -> Hypothesis {
+        view.asked = self.shortlist(view, best);
+        let view = &*view;
+        best.cost = self.cost(view, best);
         let (w, h) = (self.reference.width as i32, self.reference.height as i32);
         for (dx, dy) in NEIGHBOURS {
             let (u, v) = (x as i32 + dx, y as i32 + dy);
@@ -232,18 +238,9 @@ impl Scene<'_> {
         }
         let mut costs = [0.0; MAX_SOURCES];
         let mut seen = 0;
-        for (n, (source, map)) in self.sources.iter().enumerate() {
-            if let Some(at) = land(map, view.x, view.y, plane)
-                && source.sees(at.u, at.v)
-            {
-                let [s, ss, rs] = (self.sums)(source, &view.window, at);
-                let variance = (ss - s * s).max(0.0) + NOISE_VARIANCE;
-                let zncc = (rs - view.mean * s) / (view.variance * variance).sqrt();
-                costs[seen] = (1.0 - zncc).min(COST_LIMIT);
-                if let Some(surface) = self.surfaces.get(n) {
-                    let miss = miss(surface, view, at).min(GEOMETRY_REACH) / GEOMETRY_REACH;
-                    costs[seen] += self.params.geometry_weight * miss;
-                }
+        for n in (0..self.sources.len()).filter(|n| view.asked >> n & 1 == 1) {
+            if let Some(cost) = self.cost_in(n, view, plane) {
+                costs[seen] = cost;
                 seen += 1;
             }
         }
@@ -254,6 +251,34 @@ impl Scene<'_> {
         }
         let distance = (plane.w - view.prior).abs() / (self.params.step * self.params.prior_reach);
         photo + self.params.prior_weight * distance.min(1.0)
+    }
+
+    /// Cost of a plane in one source; `None` where that does not see it.
+    #[inline(always)]
+    fn cost_in(&self, n: usize, view: &View, plane: Hypothesis) -> Option<f32> {
+        let (source, map) = &self.sources[n];
+        let at = land(map, view.x, view.y, plane).filter(|at| source.sees(at.u, at.v))?;
+        let [s, ss, rs] = (self.sums)(source, &view.window, at);
+        let variance = (ss - s * s).max(0.0) + NOISE_VARIANCE;
+        let zncc = (rs - view.mean * s) / (view.variance * variance).sqrt();
+        let photo = (1.0 - zncc).min(COST_LIMIT);
+        let missed = self.surfaces.get(n).map_or(0.0, |surface| miss(surface, view, at).min(GEOMETRY_REACH));
+        Some(photo + self.params.geometry_weight * missed / GEOMETRY_REACH)
+    }
+
+    /// The sources that see the pixel's present plane best: half of them and one more.
+    fn shortlist(&self, view: &View, plane: Hypothesis) -> u32 {
+        let count = self.sources.len();
+        let wanted = count.div_ceil(2) + 1;
+        if wanted >= count {
+            return !0;
+        }
+        let mut ranked = [(f32::MAX, 0); MAX_SOURCES];
+        for (n, slot) in ranked[..count].iter_mut().enumerate() {
+            *slot = (self.cost_in(n, view, plane).unwrap_or(f32::MAX), n);
+        }
+        ranked[..count].sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        ranked[..wanted].iter().fold(0, |bits, (_, n)| bits | 1 << n)
     }
 }
 
@@ -289,8 +314,7 @@ fn miss(surface: &SourceSurface, view: &View, at: Affine) -> f32 {
         return GEOMETRY_REACH;
     }
     let (m, o) = (&surface.back.matrix, &surface.back.offset);
-    let q: [f32; 3] =
-        std::array::from_fn(|i| m[3 * i] * at.u + m[3 * i + 1] * at.v + m[3 * i + 2] + o[i] / depth);
+    let q: [f32; 3] = std::array::from_fn(|i| m[3 * i] * at.u + m[3 * i + 1] * at.v + m[3 * i + 2] + o[i] / depth);
     if q[2] <= 1e-9 { GEOMETRY_REACH } else { (q[0] / q[2] - view.x).hypot(q[1] / q[2] - view.y) }
 }
 
@@ -309,10 +333,6 @@ impl Random {
         let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         ((z >> 40) as f32) / (1u64 << 23) as f32 - 1.0
     }
-}
-
-fn colour_weight(step: u8) -> f32 {
-    COLOUR_WEIGHT[step as usize]
 }
 
 static COLOUR_WEIGHT: std::sync::LazyLock<[f32; 256]> =
@@ -351,12 +371,16 @@ mod tests {
         let (w, h) = (80, 50);
         // disparity 4 + 0.12 x: right(x - d(x)) = left(x), so left is sampled from the right image's texture
         let disparity = |x: f32| 4.0 + 0.12 * x;
-        let left: Vec<u8> = (0..w * h).map(|i| shade((i % w) as f32 - disparity((i % w) as f32), (i / w) as f32)).collect();
+        let left: Vec<u8> =
+            (0..w * h).map(|i| shade((i % w) as f32 - disparity((i % w) as f32), (i / w) as f32)).collect();
         let right: Vec<u8> = (0..w * h).map(|i| shade((i % w) as f32, (i / w) as f32)).collect();
         let left = Raster::new(&left, w, h, "reference").unwrap();
         let right = Raster::new(&right, w, h, "source").unwrap();
         let init: Vec<_> = (0..w * h)
-            .map(|i| Hypothesis { w: disparity((i % w) as f32) + if i % 3 == 0 { 0.8 } else { -0.6 }, ..Default::default() })
+            .map(|i| Hypothesis {
+                w: disparity((i % w) as f32) + if i % 3 == 0 { 0.8 } else { -0.6 },
+                ..Default::default()
+            })
             .collect();
         let prior = vec![0.0; w * h];
         let planes = refine(left, &[(right, PAIR)], &[], &init, &prior, &PARAMS).unwrap();

@@ -131,7 +131,7 @@ fn sweep_band(
                     n += 1;
                 }
             }
-            out[i * d + plane] = if n == 0 { UNSEEN } else { ((sum + n / 2) / n) as u8 };
+            out[i * d + plane] = (sum + n / 2).checked_div(n).map_or(UNSEEN, |mean| mean as u8);
         }
     }
 }

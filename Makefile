@@ -1,0 +1,51 @@
+# `make` alone lists the targets.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: help demo test build lint rust-test python-test bench peers format clean
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / — /'
+
+demo: $(VENV)/demo ## build, install, reconstruct the bundled sample
+	$(BIN)/mvcore demo -o out
+	@echo "the mesh lies at $(CURDIR)/out/pickup.glb"
+
+$(VENV)/demo:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet .
+	@touch $@
+
+test: lint rust-test python-test ## formatting, lints, Rust and Python tests
+
+build: ## install into the environment with what the tests need
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet '.[test]'
+
+lint: build ## formatting and lints
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --quiet -- -D warnings
+	$(BIN)/ruff format --check python tests benches examples
+	$(BIN)/ruff check python tests benches examples
+	cd tests && ../$(BIN)/python -m mypy.stubtest mvcore._core --mypy-config-file ../pyproject.toml
+
+rust-test: ## tests of the kernels
+	cargo test --release --quiet --package mvcore
+
+python-test: build ## tests of the package
+	$(BIN)/python -m pytest -q tests
+
+bench: ## throughput of each kernel
+	cargo bench --package mvcore
+
+peers: build ## each kernel beside what a user would pick instead
+	$(BIN)/pip install --quiet '.[peers]'
+	$(BIN)/python benches/peers.py
+
+format: build ## rewrite the sources in the project's format
+	cargo fmt --all
+	$(BIN)/ruff format python tests benches examples
+
+clean: ## remove what was built
+	rm -rf $(VENV) target out

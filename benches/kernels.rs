@@ -1,0 +1,246 @@
+//! Throughput of each kernel on inputs like those of a real job: `cargo bench`, or `cargo bench -- aggregate`.
+//!
+//! Images are band-limited noise shifted by a slanted plane, depth maps those of a sphere, fields those of a gyroid: textured,
+//! noisy, never constant.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use mvcore::aggregate::{Penalties, aggregate};
+use mvcore::atlas::{Source, build_atlas};
+use mvcore::consistency::{ConsistencyParams, OtherView, consistency};
+use mvcore::fuse::{FusionParams, FusionView, fuse};
+use mvcore::grid::Grid;
+use mvcore::isosurface::{isosurface_dense, isosurface_sparse};
+use mvcore::match_epipolar::{DESCRIPTOR, Features, match_epipolar};
+use mvcore::mesh::Mesh;
+use mvcore::nearest::nearest_distance;
+use mvcore::raster::{Epipolar, Raster};
+use mvcore::rasterize::rasterize;
+use mvcore::select_views::{Photo, SelectParams, rate, select_views};
+use mvcore::slanted::{Hypothesis, RefineParams, refine};
+use mvcore::sweep::sweep;
+use std::hint::black_box;
+
+const PAIR: Epipolar = Epipolar { matrix: [1., 0., 0., 0., 1., 0., 0., 0., 1.], offset: [-1., 0., 0.] };
+
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        (self.0 >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+fn shade(x: f32, y: f32) -> u8 {
+    let v = (x * 0.71).sin() + (y * 0.53 + x * 0.31).sin() + (x * 0.23 - y * 0.87).sin() + (x * 1.9 + y * 1.3).sin();
+    (127.0 + 30.0 * v) as u8
+}
+
+fn disparity(x: usize) -> f32 {
+    8.0 + 0.03 * x as f32
+}
+
+fn pair(w: usize, h: usize) -> (Vec<u8>, Vec<u8>) {
+    let left = (0..w * h).map(|i| shade((i % w) as f32 - disparity(i % w), (i / w) as f32)).collect();
+    let right = (0..w * h).map(|i| shade((i % w) as f32, (i / w) as f32)).collect();
+    (left, right)
+}
+
+fn stereo(c: &mut Criterion) {
+    let (w, h) = (384, 288);
+    let (left, right) = pair(w, h);
+    let (l, r) = (Raster::new(&left, w, h, "l").unwrap(), Raster::new(&right, w, h, "r").unwrap());
+    let planes: Vec<f32> = (0..128).map(|d| d as f32 * 0.25).collect();
+    let sources = [(r, PAIR); 6];
+    let mut group = c.benchmark_group("depth");
+    group.sample_size(10);
+    group.throughput(Throughput::Elements((w * h * 128 * 6) as u64));
+    group.bench_function("sweep 384x288x128, 6 sources", |b| b.iter(|| sweep(l, &sources, &planes, 0).unwrap()));
+    let init: Vec<_> = (0..w * h).map(|i| Hypothesis { w: disparity(i % w) + 0.4, ..Default::default() }).collect();
+    let params = RefineParams {
+        iterations: 1,
+        range: (0.5, 40.0),
+        step: 1.0,
+        max_slope: 0.5,
+        prior_weight: 0.1,
+        prior_reach: 4.0,
+        geometry_weight: 0.0,
+    };
+    let prior = vec![0.0; w * h];
+    group.throughput(Throughput::Elements((w * h) as u64));
+    group.bench_function("refine 384x288, 6 sources, 1 round", |b| {
+        b.iter(|| refine(l, &sources, &[], &init, &prior, &params).unwrap());
+    });
+    let (w, h, d) = (1280, 960, 128);
+    let mut random = Random(7);
+    let guide = pair(w, h).0;
+    let costs: Vec<u8> = (0..w * h * d)
+        .map(|i| {
+            let miss = ((i % d) as f32 - disparity(i / d % w)).abs();
+            (miss * 6.0).min(40.0) as u8 + (random.next() * 20.0) as u8
+        })
+        .collect();
+    let guide = Raster::new(&guide, w, h, "guide").unwrap();
+    let penalties = Penalties { p1: 6, p2: 60, p2_falloff: 12 };
+    group.throughput(Throughput::Bytes((w * h * d) as u64));
+    group.bench_function("aggregate 1280x960x128", |b| b.iter(|| aggregate(&costs, d, guide, penalties).unwrap()));
+    group.finish();
+}
+
+/// Cameras on a ring around the origin, looking at it: P, centre, rotation rows.
+fn ring(n: usize, k: usize, w: usize, h: usize, focal: f64) -> ([f64; 12], [f64; 3]) {
+    let a = std::f64::consts::TAU * k as f64 / n as f64;
+    let (s, c) = a.sin_cos();
+    let r = [[-s, c, 0.0], [0.0, 0.0, -1.0], [-c, -s, 0.0]];
+    let t = [0.0, 0.0, 3.0];
+    let (cx, cy) = ((w - 1) as f64 / 2.0, (h - 1) as f64 / 2.0);
+    let column = |j: usize| {
+        let v = |row: usize| if j < 3 { r[row][j] } else { t[row] };
+        [focal * v(0) + cx * v(2), focal * v(1) + cy * v(2), v(2)]
+    };
+    (std::array::from_fn(|i| column(i % 4)[i / 4]), [3.0 * c, 3.0 * s, 0.0])
+}
+
+fn sphere_depth(w: usize, h: usize, focal: f64, radius: f64) -> Vec<f32> {
+    let (cx, cy) = ((w - 1) as f64 / 2.0, (h - 1) as f64 / 2.0);
+    (0..w * h)
+        .map(|i| {
+            let d = [((i % w) as f64 - cx) / focal, ((i / w) as f64 - cy) / focal, 1.0];
+            let (a, b) = (d.iter().map(|v| v * v).sum::<f64>(), 3.0);
+            let root = b * b - a * (9.0 - radius * radius);
+            if root > 0.0 { ((b - root.sqrt()) / a) as f32 } else { 0.0 }
+        })
+        .collect()
+}
+
+const FUSION: FusionParams = FusionParams {
+    truncation: 0.03,
+    free_weight: 0.3,
+    min_weight: 0.05,
+    solid_weight: 0.5,
+    hull_tolerance: 0.05,
+    max_memory: 4 << 30,
+};
+
+fn volumes(c: &mut Criterion) {
+    let (w, h, focal) = (640, 480, 600.0);
+    let depth = sphere_depth(w, h, focal, 1.0);
+    let weight = vec![1.0f32; w * h];
+    let raster = |d| Raster::new(d, w, h, "depth").unwrap();
+    let view = |k| FusionView {
+        depth: raster(&depth),
+        weight: raster(&weight),
+        silhouette: None,
+        projection: ring(24, k, w, h, focal).0,
+        focal,
+    };
+    let views: Vec<_> = (0..24).map(view).collect();
+    let grid = Grid::new([-1.1; 3], 2.2 / 255.0, [256; 3]).unwrap();
+    let mut group = c.benchmark_group("volume");
+    group.sample_size(10);
+    group.throughput(Throughput::Elements((24 * w * h) as u64));
+    group.bench_function("fuse 24 maps 640x480 into 256^3", |b| b.iter(|| fuse(grid, &views, &FUSION).unwrap()));
+    let volume = fuse(grid, &views, &FUSION).unwrap();
+    group.throughput(Throughput::Elements(volume.values.len() as u64));
+    group.bench_function("isosurface of that, sparse", |b| {
+        b.iter(|| isosurface_sparse(&volume.map, &volume.values).unwrap());
+    });
+    for n in [128usize, 256, 512] {
+        let field: Vec<f32> = (0..n * n * n)
+            .map(|p| {
+                let x = [p / (n * n), p / n % n, p % n].map(|v| (v as f32 + 0.5) / n as f32 - 0.5);
+                (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]).sqrt() - 0.4
+            })
+            .collect();
+        group.throughput(Throughput::Bytes((4 * n * n * n) as u64));
+        group.bench_with_input(BenchmarkId::new("isosurface of a sphere, dense", n), &n, |b, _| {
+            b.iter(|| isosurface_dense(&field, [n; 3]).unwrap());
+        });
+    }
+    let back = |s: f32| Epipolar { offset: [-s, 0., 0.], ..PAIR };
+    let others: Vec<_> = [0.1f32, -0.1, 0.2, -0.2]
+        .iter()
+        .map(|&s| OtherView { depth: raster(&depth), there: back(s), back: back(-s) })
+        .collect();
+    let params = ConsistencyParams { min_views: 1, pixel_unit: 0.5, depth_unit: 1.0 / 600.0 };
+    group.throughput(Throughput::Elements((w * h) as u64));
+    group.bench_function("consistency 640x480, 4 views", |b| {
+        b.iter(|| consistency(raster(&depth), &others, &params).unwrap());
+    });
+    group.finish();
+}
+
+fn meshes(c: &mut Criterion) {
+    let n = 160;
+    let field: Vec<f32> = (0..n * n * n)
+        .map(|p: usize| {
+            let x = [p / (n * n), p / n % n, p % n].map(|v| (v as f32 + 0.5) / n as f32 - 0.5);
+            (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]).sqrt() - 0.4 + 0.01 * (60.0 * x[0]).sin() * (60.0 * x[2]).sin()
+        })
+        .collect();
+    let surface = isosurface_dense(&field, [n; 3]).unwrap();
+    let vertices: Vec<[f64; 3]> =
+        surface.vertices.iter().map(|v| v.map(|x| (f64::from(x) / n as f64 - 0.5) * 2.4)).collect();
+    let mesh = Mesh::new(&vertices, &surface.faces).unwrap();
+    let (w, h, focal) = (1024, 768, 900.0);
+    let rgb: Vec<u8> = (0..w * h * 3).map(|i| shade((i / 3 % w) as f32, (i / 3 / w) as f32)).collect();
+    let detail: Vec<f32> = (0..w * h).map(|i| f32::from(shade((i % w) as f32, (i / w) as f32)) / 8.0).collect();
+    let image = Raster::new(&rgb, 3 * w, h, "rgb").unwrap();
+    let mut group = c.benchmark_group("texture");
+    group.sample_size(10);
+    group.throughput(Throughput::Elements(surface.faces.len() as u64));
+    let (p, center) = ring(8, 0, w, h, focal);
+    group.bench_function("rasterize", |b| b.iter(|| rasterize(mesh, &p, w, h).unwrap()));
+    let (depth, _) = rasterize(mesh, &p, w, h).unwrap();
+    let photo = Photo {
+        rgb: image,
+        detail: Raster::new(&detail, w, h, "detail").unwrap(),
+        depth: Raster::new(&depth, w, h, "depth").unwrap(),
+        projection: p,
+        center,
+    };
+    group.bench_function("rate", |b| b.iter(|| rate(mesh, &photo, 0.02).unwrap()));
+    let ratings: Vec<_> = (0..8)
+        .map(|k| {
+            let (p, center) = ring(8, k, w, h, focal);
+            let (depth, _) = rasterize(mesh, &p, w, h).unwrap();
+            let depth = Raster::new(&depth, w, h, "depth").unwrap();
+            rate(mesh, &Photo { depth, projection: p, center, ..photo }, 0.02).unwrap()
+        })
+        .collect();
+    let params = SelectParams { seam: 0.5, outlier: 60.0, least_patch: 32 };
+    group.bench_function("select_views, 8 views", |b| b.iter(|| select_views(mesh, &ratings, &params).unwrap()));
+    let labels = select_views(mesh, &ratings, &params).unwrap();
+    let sources: Vec<_> =
+        (0..8).map(|k| Source { rgb: image, projection: ring(8, k, w, h, focal).0, gain: [1.0; 3] }).collect();
+    group.bench_function("build_atlas, 8 views", |b| b.iter(|| build_atlas(mesh, &labels, &sources, 8192).unwrap()));
+    group.throughput(Throughput::Elements(vertices.len() as u64));
+    let shifted: Vec<[f64; 3]> = vertices.iter().map(|v| v.map(|x| x * 1.01)).collect();
+    group.bench_function("nearest_distance", |b| b.iter(|| nearest_distance(&shifted, &vertices).unwrap()));
+    group.finish();
+}
+
+fn features(c: &mut Criterion) {
+    let mut random = Random(11);
+    let n = 4000;
+    let positions: Vec<[f32; 2]> =
+        (0..n).map(|_| [(random.next() * 1024.0) as f32, (random.next() * 768.0) as f32]).collect();
+    let descriptors: Vec<[u8; DESCRIPTOR]> =
+        (0..n).map(|_| std::array::from_fn(|_| (random.next().powi(3) * 160.0) as u8)).collect();
+    let f = Features { positions: &positions, descriptors: &descriptors };
+    let rectified = [0., 0., 0., 0., 0., -1., 0., 1., 0.];
+    let mut group = c.benchmark_group("sparse");
+    group.throughput(Throughput::Elements((n * n) as u64));
+    for (name, band) in [("guided, 2 px", 2.0), ("unguided", f32::INFINITY)] {
+        group.bench_function(BenchmarkId::new("match_epipolar 4000 x 4000", name), |b| {
+            b.iter(|| black_box(match_epipolar(f, f, &rectified, band, 0.8).unwrap()));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, features, stereo, volumes, meshes);
+criterion_main!(benches);

@@ -1,0 +1,121 @@
+"""The Rust kernels. Arrays must be C-contiguous; wrong shapes raise `ValueError`, bad values `InvalidInputError`."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "aggregate",
+    "build_atlas",
+    "components",
+    "consistency",
+    "encode_png",
+    "fuse",
+    "isosurface_dense",
+    "isosurface_sparse",
+    "match_epipolar",
+    "nearest_distance",
+    "rasterize",
+    "rate_faces",
+    "read_obj",
+    "refine",
+    "select_views",
+    "sweep",
+]
+
+_F32 = NDArray[np.float32]
+_F64 = NDArray[np.float64]
+_U8 = NDArray[np.uint8]
+_U32 = NDArray[np.uint32]
+_I32 = NDArray[np.int32]
+
+def sweep(reference: _U8, images: Sequence[_U8], maps: _F32, planes: _F32, best: int = 0) -> _U8: ...
+def aggregate(costs: _U8, guide: _U8, p1: int, p2: int, p2_falloff: int) -> tuple[_F32, _F32]: ...
+def refine(
+    reference: _U8,
+    images: Sequence[_U8],
+    maps: _F32,
+    depths: Sequence[_F32],
+    backs: _F32,
+    init: _F32,
+    prior: _F32,
+    *,
+    iterations: int,
+    low: float,
+    high: float,
+    step: float,
+    max_slope: float,
+    prior_weight: float,
+    prior_reach: float,
+    geometry_weight: float,
+) -> _F32: ...
+def consistency(
+    depth: _F32,
+    others: Sequence[_F32],
+    there: _F32,
+    back: _F32,
+    min_views: int,
+    pixel_unit: float,
+    depth_unit: float,
+) -> tuple[_F32, _U8]: ...
+def fuse(
+    origin: Sequence[float],
+    voxel: float,
+    shape: Sequence[int],
+    depths: Sequence[_F32],
+    weights: Sequence[_F32],
+    silhouettes: Sequence[_F32] | None,
+    projections: _F64,
+    *,
+    truncation: float,
+    free_weight: float,
+    min_weight: float,
+    solid_weight: float,
+    hull_tolerance: float,
+    max_memory: int,
+) -> tuple[_U32, _F32]: ...
+def isosurface_dense(values: _F32) -> tuple[_F32, _U32]: ...
+def isosurface_sparse(blocks: Sequence[int], coords: _U32, values: _F32) -> tuple[_F32, _U32]: ...
+def components(faces: _U32) -> _U32: ...
+def nearest_distance(points: _F64, others: _F64) -> _F64: ...
+def match_epipolar(
+    positions_a: _F32,
+    descriptors_a: _U8,
+    positions_b: _F32,
+    descriptors_b: _U8,
+    fundamental: _F64,
+    band: float,
+    ratio: float,
+) -> _U32: ...
+def rasterize(vertices: _F64, faces: _U32, matrix: _F64, width: int, height: int) -> tuple[_F32, _I32]: ...
+def rate_faces(
+    vertices: _F64,
+    faces: _U32,
+    image: _U8,
+    detail: _F32,
+    depth: _F32,
+    matrix: _F64,
+    center: Sequence[float],
+    tolerance: float,
+) -> tuple[_F32, _U8]: ...
+def select_views(
+    vertices: _F64,
+    faces: _U32,
+    qualities: Sequence[_F32],
+    colours: Sequence[_U8],
+    seam: float,
+    outlier: float,
+    least_patch: int,
+) -> _I32: ...
+def build_atlas(
+    vertices: _F64,
+    faces: _U32,
+    labels: _I32,
+    images: Sequence[_U8],
+    matrices: Sequence[_F64],
+    gains: Sequence[Sequence[float]],
+    max_size: int,
+) -> tuple[_U32, _F32, _U32, _U8]: ...
+def encode_png(rgb: _U8) -> bytes: ...
+def read_obj(path: str) -> tuple[_F64, _U32]: ...

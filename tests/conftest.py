@@ -1,0 +1,77 @@
+import json
+from pathlib import Path
+
+import cv2
+import mvcore
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared" / "data"
+
+
+@pytest.fixture
+def shared() -> Path:
+    """The evaluation data beside the checkout; tests that need it skip without it."""
+    if not SHARED.is_dir():
+        pytest.skip("no evaluation data beside the checkout")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def sample() -> Path:
+    return ROOT / "python" / "mvcore" / "sample"
+
+
+def look_at(center, target, size=(240, 180), focal=225.0, up=(0.0, 0.0, 1.0)) -> mvcore.Camera:
+    center, target = np.asarray(center, float), np.asarray(target, float)
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    r = np.stack([x, np.cross(z, x), z])
+    k = [[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]]
+    return mvcore.Camera(K=k, R=r, t=-r @ center, width=size[0], height=size[1])
+
+
+def texture_of(points) -> np.ndarray:
+    """A texture in space: sums of sines of many directions, (n, 3) uint8."""
+    rng = np.random.default_rng(3)
+    waves = rng.normal(size=(40, 3)) * rng.uniform(4, 26, (40, 1))
+    phase, colour = rng.uniform(0, 6.28, 40), rng.uniform(0.3, 1, (40, 3))
+    value = np.sin(points @ waves.T + phase) @ colour
+    return np.clip(128 + 24 * value, 0, 255).astype(np.uint8)
+
+
+def render_sphere(camera: mvcore.Camera, radius=0.5):
+    """A textured sphere at the origin before a textured wall far behind: image (h, w, 3), depth (h, w), mask (h, w)."""
+    grid = camera.pixel_grid().reshape(-1, 2)
+    rays = np.column_stack([grid, np.ones(len(grid))]) @ np.linalg.inv(camera.K).T @ camera.R
+    o = camera.center
+    a, b, c = (rays**2).sum(1), rays @ o, o @ o - radius**2
+    root = b * b - a * c
+    hit = root > 0
+    s = np.where(hit, (-b - np.sqrt(root.clip(0))) / a, 6.0)
+    image = texture_of(o + rays * s[:, None])
+    shape = (camera.height, camera.width)
+    return image.reshape(*shape, 3), np.where(hit, s, 0).reshape(shape), hit.reshape(shape)
+
+
+@pytest.fixture(scope="session")
+def ring():
+    """Twelve views around a textured sphere: cameras, images, depths, masks."""
+    angles = np.radians(np.arange(0, 360, 30))
+    cameras = [look_at((2 * np.cos(a), 2 * np.sin(a), 0.6 * (i % 2)), (0, 0, 0)) for i, a in enumerate(angles)]
+    images, depths, masks = zip(*(render_sphere(c) for c in cameras))
+    return cameras, list(images), list(depths), list(masks)
+
+
+def write_scene(folder: Path, cameras, images) -> Path:
+    (folder / "images").mkdir(parents=True)
+    views = []
+    for n, (c, image) in enumerate(zip(cameras, images)):
+        name = f"images/{n:03d}.png"
+        cv2.imwrite(str(folder / name), np.asarray(image)[..., ::-1])
+        view = {"image": name, "width": c.width, "height": c.height}
+        views.append(view | {"K": c.K.tolist(), "R": c.R.tolist(), "t": c.t.tolist()})
+    (folder / "cameras.json").write_text(json.dumps({"views": views}))
+    return folder

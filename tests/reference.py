@@ -1,0 +1,50 @@
+"""Slow, readable NumPy twins of the kernels."""
+
+import numpy as np
+
+
+def project(k, r, t, points):
+    q = (points @ r.T + t) @ k.T
+    return q[:, :2] / q[:, 2:], q[:, 2]
+
+
+def tsdf(grid_points, depths, cameras, truncation, free_weight):
+    """Mean of clamp(depth - z, -τ, τ) / τ over the views, nearest pixel; NaN where never seen."""
+    total, weight = np.zeros(len(grid_points)), np.zeros(len(grid_points))
+    for depth, c in zip(depths, cameras):
+        x, z = project(c.K, c.R, c.t, grid_points)
+        i = np.rint(x).astype(int)
+        inside = (i[:, 0] >= 0) & (i[:, 1] >= 0) & (i[:, 0] < c.width) & (i[:, 1] < c.height) & (z > 0)
+        d = np.zeros(len(z))
+        d[inside] = depth[i[inside, 1], i[inside, 0]]
+        distance = (d - z) / truncation
+        w = np.where((d > 0) & (distance >= -1), np.where(distance > 1, free_weight, 1.0), 0.0)
+        total += w * np.clip(distance, -1, 1)
+        weight += w
+    with np.errstate(invalid="ignore"):
+        return np.where(weight > 0, total / weight, np.nan)
+
+
+def consistency(depth, others, cameras, pixel_unit, depth_unit, min_views):
+    """The dynamic rule on constant-depth-per-pixel maps, nearest sampling; ``cameras[0]`` is the reference's."""
+    reference = cameras[0]
+    h, w = depth.shape
+    kept = np.zeros_like(depth)
+    for y in range(h):
+        for x in range(w):
+            z = depth[y, x]
+            if z <= 0:
+                continue
+            votes = []
+            for other, c in zip(others, cameras[1:]):
+                p = reference.unproject([[x, y]], [z])
+                q = c.project(p)[0]
+                i = np.rint(q).astype(int)
+                if not (0 <= q[0] <= c.width - 1 and 0 <= q[1] <= c.height - 1) or other[i[1], i[0]] <= 0:
+                    continue
+                back = reference.to_camera(c.unproject([q], [other[i[1], i[0]]]))[0]
+                pixel = reference.project(reference.unproject([[x, y]], [z]) * 0 + c.unproject([q], [other[i[1], i[0]]]))[0]
+                votes.append(max(np.hypot(*(pixel - [x, y])) / pixel_unit, abs(back[2] - z) / (z * depth_unit)))
+            if any(sum(v < n for v in votes) >= n for n in range(min_views, 11)):
+                kept[y, x] = z
+    return kept

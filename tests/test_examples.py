@@ -1,0 +1,45 @@
+"""The examples, the docstrings' examples and the README's code run."""
+
+import doctest
+import importlib
+import re
+import runpy
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT, write_scene
+
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def small(ring, tmp_path_factory):
+    cameras, images, _, _ = ring
+    return write_scene(tmp_path_factory.mktemp("small") / "scene", cameras[:6], images[:6])
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_an_example_runs(path, small, tmp_path):
+    suffix = ".ply" if "step" in path.stem else ".glb"
+    subprocess.run([sys.executable, str(path), str(small), str(tmp_path / f"a{suffix}")], check=True, capture_output=True)
+    assert (tmp_path / f"a{suffix}").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("module", ["cameras", "config", "depth", "surface"])
+def test_docstrings(module):
+    result = doctest.testmod(importlib.import_module(f"mvcore.{module}"), extraglobs={"np": np})
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+def test_the_readme_code(small, tmp_path, monkeypatch):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(blocks) == 2
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fountain").symlink_to(small)
+    for n, block in enumerate(blocks):
+        (tmp_path / f"block{n}.py").write_text(block)
+        runpy.run_path(str(tmp_path / f"block{n}.py"))
+    assert (tmp_path / "fountain.glb").is_file()

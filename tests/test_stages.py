@@ -1,0 +1,277 @@
+import cv2
+import mvcore
+import numpy as np
+import pytest
+import reference
+from conftest import look_at
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mvcore import _core
+from mvcore.config import Config, DepthConfig, SurfaceConfig, VolumeConfig
+from mvcore.depth import View, estimate_depth, filter_depth
+from mvcore.errors import InvalidInputError, ReconstructionError
+from mvcore.io.images import read_image
+from mvcore.sparse import (
+    calibration_error,
+    candidate_pairs,
+    check_calibration,
+    choose_sources,
+    common_volume,
+    convergence,
+    depth_ranges,
+    detect,
+    find_points,
+    fundamental,
+    hull_box,
+    surrounds,
+    target_box,
+    view_scores,
+)
+from mvcore.surface import Surface, decimate, drop_small_parts, extract_surface, marching_cubes, smooth
+from mvcore.texture import colour_gains, texture
+from mvcore.types import DepthMap, Report
+from mvcore.volume import Volume, fuse, silhouette_distance
+
+
+def test_unknown_settings_name_the_nearest():
+    with pytest.raises(InvalidInputError, match="did you mean 'footprints'"):
+        Config.from_dict({"volume": {"footprint": 2}})
+    with pytest.raises(InvalidInputError, match="matcher"):
+        Config.from_dict({"matcher": "magic"})
+    assert Config.from_dict({"depth": {"planes": 64}}).depth.planes == 64
+
+
+def test_the_fundamental_matrix_puts_points_on_lines():
+    a, b = look_at((2, 0, 0.3), (0, 0, 0)), look_at((1.7, 1, 0.2), (0, 0, 0))
+    p = np.random.default_rng(0).normal(size=(20, 3)) * 0.2
+    x, y = (np.column_stack([c.project(p), np.ones(20)]) for c in (a, b))
+    assert np.abs(np.einsum("ni,ij,nj->n", y, fundamental(a, b), x)).max() < 1e-9
+
+
+def test_points_ranges_and_box_of_a_ring(ring):
+    cameras, images, depths, _ = ring
+    report = Report()
+    points = find_points(images, cameras, report=report)
+    assert len(points) > 40
+    radius = np.linalg.norm(points.positions, axis=1)
+    assert np.median(np.abs(radius[radius < 1] - 0.5)) < 0.005
+    assert surrounds(cameras)
+    assert np.allclose(convergence(cameras), 0, atol=1e-6)
+    box = target_box(cameras, points)
+    assert (box[0] < -0.5).all()
+    assert (box[1] > 0.5).all()
+    for (near, far), depth in zip(depth_ranges(cameras, points, box, 0.25, False), depths):
+        assert near < depth[depth > 0].min()
+        assert far > depth.max()
+    sources = choose_sources(view_scores(cameras, points, box, DepthConfig()), 4)
+    assert {sources[3][0], sources[3][1]} == {2, 4}
+
+
+def test_a_wrong_calibration_is_refused_and_a_doubtful_one_is_said(sample):
+    scene = mvcore.load(sample)
+    cameras = list(scene.calib)
+    features = [detect(read_image(f), None, 2000) for f in scene.frames]
+    pairs = candidate_pairs(cameras, 6)
+
+    def check(degrees):
+        r = cv2.Rodrigues(np.radians(degrees) * np.array([0.8, 0.5, 0.3]))[0]
+        turned = [mvcore.Camera(c.K, (r if n % 2 else r.T) @ c.R, c.t, c.width, c.height) for n, c in enumerate(cameras)]
+        report = Report()
+        check_calibration(*calibration_error(turned, features, pairs), turned, Config().sparse, report)
+        return report
+
+    assert not check(0.0).warnings
+    assert "doubtful" in check(0.25).warnings[0]
+    with pytest.raises(ReconstructionError, match="does not fit the images"):
+        check(2.0)
+
+
+def test_textureless_scenes_fall_back_to_the_common_volume(ring):
+    cameras = ring[0]
+    grey = [np.full((c.height, c.width, 3), 90, np.uint8) for c in cameras]
+    report = Report()
+    points = find_points(grey, cameras, report=report)
+    assert len(points) == 0
+    box = target_box(cameras, points)
+    assert np.allclose(box, common_volume(cameras))
+    assert "too few sure matches" in report.warnings[0]
+
+
+def test_the_box_of_the_hull_is_tight(ring):
+    cameras, _, _, masks = ring
+    grown = [(m * 255).astype(np.uint8) for m in masks]
+    box = hull_box(cameras, grown, np.array([[-2.0, -2, -2], [2, 2, 2]]))
+    assert (np.abs(box) >= 0.5).all()
+    assert (np.abs(box) < 0.75).all()
+
+
+def test_depth_of_a_sphere_and_its_filter(ring):
+    cameras, images, depths, masks = ring
+    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c) for i, c in zip(images, cameras)]
+    found = [estimate_depth(views[n], [views[j % 12] for j in (n - 2, n - 1, n + 1, n + 2)], 1.2, 2.6) for n in range(12)]
+    share, kept, right = [], [], []
+    for n in range(12):
+        want = masks[n]
+        share.append((np.abs(found[n].depth - depths[n]) < 0.01 * depths[n])[want].mean())
+        filtered, support = filter_depth(n, found, cameras, [(n - 1) % 12, (n + 1) % 12])
+        on = want & (filtered.depth > 0)
+        kept.append(on.sum() / want.sum())
+        right.append((np.abs(filtered.depth - depths[n]) < 0.01 * depths[n])[on].mean())
+        assert ((support > 0) == (filtered.depth > 0)).all()
+    assert np.mean(share) > 0.8
+    assert np.mean(kept) > 0.5
+    assert np.mean(right) > 0.95
+
+
+def test_depth_needs_sources_and_a_range(ring):
+    cameras, images, _, _ = ring
+    view = View(cv2.cvtColor(images[0], cv2.COLOR_RGB2GRAY), cameras[0])
+    with pytest.raises(InvalidInputError, match="sources"):
+        estimate_depth(view, [], 1, 2)
+    with pytest.raises(InvalidInputError, match="near, far"):
+        estimate_depth(view, [view], 2, 1)
+
+
+def test_consistency_equals_its_twin():
+    cameras = [look_at((x, -3.0, 0.1 * x), (x, 0, 0), (24, 18), 30.0) for x in (0.0, 0.3, -0.3)]
+    rng = np.random.default_rng(1)
+    maps = [np.where(rng.random((18, 24)) < 0.3, 3.6, 3.0).astype(np.float32) for _ in cameras]
+    maps[0][3, 4] = 0
+    there = np.stack([mvcore.cameras.relative_map(cameras[0], c) for c in cameras[1:]])
+    back = np.stack([mvcore.cameras.relative_map(c, cameras[0]) for c in cameras[1:]])
+    for min_views in (1, 2):
+        # 20 % steps: no two taps of a bilinear sample mix, so the nearest pixel decides in both
+        kept, _ = _core.consistency(maps[0], maps[1:], there, back, min_views, 0.5, 0.05)
+        twin = reference.consistency(maps[0], maps[1:], cameras, 0.5, 0.05, min_views)
+        same = (kept > 0) == (twin > 0)
+        assert same.mean() > 0.97  # four equal taps are interpolated, which moves nothing; rounding may differ at ties
+
+
+def test_fusion_equals_its_twin(ring):
+    cameras, _, depths, _ = ring
+    maps = [DepthMap(d.astype(np.float32), np.ones(d.shape, np.float32)) for d in depths]
+    bounds = np.array([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
+    config = VolumeConfig(voxel=0.03, free_weight=0.5, min_weight=0.0)
+    volume = fuse(maps, cameras, bounds, config=config)
+    local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points = volume.origin + volume.voxel * (volume.coords[:, None].astype(float) * 8 + local).reshape(-1, 3)
+    # The twin samples the nearest pixel and weighs all views alike: compare where weights are alike and the surface is smooth.
+    twin = reference.tsdf(points, depths, cameras, 4 * volume.voxel, 0.5)
+    ours = volume.values.reshape(-1)
+    both = np.isfinite(twin) & np.isfinite(ours) & (np.linalg.norm(points, axis=1) < 0.62)
+    assert both.sum() > 1000
+    assert np.median(np.abs(twin - ours)[both]) < 0.05
+    surface = extract_surface(volume)
+    radius = np.linalg.norm(surface.vertices, axis=1)
+    assert np.abs(radius - 0.5).mean() < 0.1 * volume.voxel
+
+
+def test_silhouettes_alone_give_the_hull(ring):
+    cameras, _, _, masks = ring
+    nothing = [DepthMap(np.zeros(m.shape, np.float32), np.zeros(m.shape, np.float32)) for m in masks]
+    cut = [(m * 255).astype(np.uint8) for m in masks]
+    bounds = np.array([[-0.8, -0.8, -0.8], [0.8, 0.8, 0.8]])
+    surface = extract_surface(fuse(nothing, cameras, bounds, cut, VolumeConfig(voxel=0.03)))
+    radius = np.linalg.norm(surface.vertices, axis=1)
+    assert radius.min() > 0.48
+    assert np.median(radius) < 0.53
+
+
+def test_silhouette_distance_is_signed_pixels():
+    mask = np.zeros((9, 9), np.uint8)
+    mask[:, 4:] = 255
+    assert silhouette_distance(mask)[4].tolist() == [3.5, 2.5, 1.5, 0.5, -0.5, -1.5, -2.5, -3.5, -4.5]
+
+
+def test_voxels_grow_until_the_memory_suffices(ring):
+    cameras, _, depths, _ = ring
+    maps = [DepthMap(d.astype(np.float32), np.ones(d.shape, np.float32)) for d in depths]
+    report = Report()
+    bounds = np.array([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
+    fuse(maps, cameras, bounds, config=VolumeConfig(voxel=0.01, max_memory=1 << 20), report=report)
+    assert "voxels grew" in report.warnings[0]
+    with pytest.raises(ReconstructionError, match="inside the bounds"):
+        fuse(maps, cameras, bounds + 100, config=VolumeConfig(voxel=0.03))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 2**32 - 1))
+def test_marching_cubes_equals_the_sparse_form_and_stays_inside(shape, seed):
+    values = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    vertices, faces = marching_cubes(values)
+    assert (vertices >= 0).all()
+    assert (vertices <= np.array(shape) - 1).all()
+    assert len(faces) == 0 or faces.max() < len(vertices)
+    blocks = tuple(-(-n // 8) for n in shape)
+    padded = np.full([8 * b for b in blocks], np.nan, np.float32)
+    padded[: shape[0], : shape[1], : shape[2]] = values
+    coords = np.ascontiguousarray(np.argwhere(np.ones(blocks, bool)), np.uint32)
+    cut = padded.reshape(blocks[0], 8, blocks[1], 8, blocks[2], 8).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 8, 8, 8)
+    sparse_vertices, sparse_faces = _core.isosurface_sparse(list(blocks), coords, np.ascontiguousarray(cut))
+    assert (sparse_vertices == vertices).all()
+    assert (sparse_faces == faces).all()
+
+
+def test_marching_cubes_refuses_another_shape():
+    with pytest.raises(InvalidInputError, match="values"):
+        marching_cubes(np.zeros((3, 3), np.float32))
+
+
+def ball(n=40, radius=14.0):
+    x = np.stack(np.meshgrid(*[np.arange(n, dtype=np.float32)] * 3, indexing="ij")) - (n - 1) / 2
+    vertices, faces = marching_cubes(np.sqrt((x**2).sum(0)) - radius)
+    return Surface(vertices.astype(np.float64), faces)
+
+
+def test_small_parts_are_dropped():
+    large, small = ball(), ball(16, 3.0)
+    both = Surface(
+        np.concatenate([large.vertices, small.vertices + 100]),
+        np.concatenate([large.faces, small.faces + len(large.vertices)]).astype(np.uint32),
+    )
+    assert len(drop_small_parts(both, 0.2).faces) == len(large.faces)
+    assert len(drop_small_parts(both, 0.0).faces) == len(both.faces)
+
+
+def test_smoothing_keeps_the_volume_and_decimation_the_shape():
+    surface = ball()
+    noisy = Surface(surface.vertices + np.random.default_rng(0).normal(0, 0.2, surface.vertices.shape), surface.faces)
+    center = surface.vertices.mean(0)
+    radius = np.linalg.norm(smooth(noisy, 10).vertices - center, axis=1)
+    assert radius.std() < 0.5 * np.linalg.norm(noisy.vertices - center, axis=1).std()
+    assert abs(radius.mean() - 14) < 0.1
+    small = decimate(surface, 500)
+    assert 300 < len(small.faces) <= 510
+    assert np.abs(np.linalg.norm(small.vertices - center, axis=1) - 14).max() < 0.5
+
+
+def test_an_empty_field_is_an_error():
+    volume = Volume(np.zeros(3), 1.0, (8, 8, 8), np.zeros((1, 3), np.uint32), np.ones((1, 8, 8, 8), np.float32))
+    with pytest.raises(ReconstructionError, match="no surface"):
+        extract_surface(volume, SurfaceConfig())
+
+
+def test_gains_bring_exposures_together():
+    rng = np.random.default_rng(0)
+    base = rng.integers(60, 160, (500, 3))
+    factors = np.array([0.8, 1.0, 1.25])
+    colours = [np.clip(base * f, 0, 255).astype(np.uint8) for f in factors]
+    gains = colour_gains([np.ones(500, np.float32)] * 3, colours)
+    assert np.allclose(gains[:, 0] * factors, (gains[:, 0] * factors).mean(), rtol=0.03)
+
+
+def test_texture_shows_the_photographs(ring):
+    from mvcore import metrics
+
+    cameras, images, _, _ = ring
+    scaled = ball()
+    surface = Surface((scaled.vertices - scaled.vertices.mean(0)) / 14 * 0.5, scaled.faces)
+    textured = texture(surface, images[1:], cameras[1:])
+
+    class Mesh:
+        vertices, faces, uv, texture = textured.vertices, textured.faces, textured.uv, textured.atlas
+
+    figures = metrics.photo_metrics(Mesh, images[0], cameras[0], ring[3][0])
+    assert figures["coverage"] > 0.98
+    assert figures["psnr_hit"] > 24
+    assert (textured.view < 0).mean() < 0.2  # the poles, which no camera sees
