@@ -95,8 +95,8 @@ class VolumeConfig:
     """Weight of seeing through a voxel against seeing a surface there."""
     min_weight: float = 0.05
     """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
-    solid_weight: float = 1.0
-    """With masks: free-space weight that carves the inside of the hull where no surface was seen; more than one wrong view has."""
+    solid_weight: float = 3.0
+    """With masks: weight of observations that overrules the solid inside of the hull: more than a few wrong views have."""
     hull_tolerance: float = 0.03
     """Share of the silhouettes that may disagree: one wrong mask among many does no harm."""
     max_memory: int = 4 << 30

@@ -40,7 +40,7 @@ pub struct FusionParams {
     pub free_weight: f32,
     /// Weight of surface observations below which a voxel is not inside; free space needs none.
     pub min_weight: f32,
-    /// Free-space weight that carves the inside of the hull where no surface was seen.
+    /// With silhouettes: weight of observations that overrules the solid inside of the hull.
     pub solid_weight: f32,
     /// Share of the silhouettes that see a voxel and may disagree with its being inside.
     pub hull_tolerance: f32,
@@ -253,11 +253,13 @@ fn integrate(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionPar
             add_row(view, &stepper, i, j, inverse_truncation, params.free_weight, sum, total, near);
         }
     }
+    // With silhouettes the inside of the hull is solid until enough observations, of surface or of free space, overrule it.
+    let (least_near, least_free) =
+        if masked { (params.solid_weight, params.solid_weight) } else { (params.min_weight, 0.0) };
     for n in 0..BLOCK {
         let mean = sum[n] / total[n].max(1e-12);
-        // Where no surface was seen, one view that looks through must not carve the solid inside of the hull.
-        let carved = total[n] > if masked { params.solid_weight } else { 0.0 } && mean >= 0.0;
-        out[n] = if total[n] > 0.0 && (near[n] >= params.min_weight.max(f32::MIN_POSITIVE) || carved) {
+        let known = total[n] > 0.0 && (near[n] >= least_near || (mean >= 0.0 && total[n] > least_free));
+        out[n] = if known {
             mean
         } else if masked {
             -1.0
