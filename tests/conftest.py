@@ -5,6 +5,10 @@ import cv2
 import mvcore
 import numpy as np
 import pytest
+from hypothesis import settings
+
+settings.register_profile("mvcore", deadline=None)  # machines are noisy: no timings in tests
+settings.load_profile("mvcore")
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "data"

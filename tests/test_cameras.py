@@ -50,7 +50,7 @@ def test_projection_and_unprojection_are_inverse():
 
 def test_resizing_keeps_pixel_centres():
     camera = look_at((1, 2, 0.5), (0, 0, 0))
-    half = camera.resized(80, 60)
+    half = camera.resized(120, 90)
     x = camera.project([[0.1, 0.05, -0.1]])
     assert np.allclose(half.project([[0.1, 0.05, -0.1]]), (x + 0.5) / 2 - 0.5)
 

@@ -194,7 +194,7 @@ def test_voxels_grow_until_the_memory_suffices(ring):
         fuse(maps, cameras, bounds + 100, config=VolumeConfig(voxel=0.03))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 2**32 - 1))
 def test_marching_cubes_equals_the_sparse_form_and_stays_inside(shape, seed):
     values = np.random.default_rng(seed).normal(size=shape).astype(np.float32)

@@ -329,13 +329,12 @@ def depth_ranges(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, s
     """
     corners = np.array(list(itertools.product(*box.T)))
     ranges = []
-    for v, c in enumerate(cameras):
+    for c in cameras:
         z_box = c.to_camera(corners)[:, 2]
         far_box = max(float(z_box.max()), 1e-9)
         near_box = max(float(z_box.min()), 0.02 * far_box)
-        seen = points.positions[points.visible[v]]
-        if len(seen) < LEAST_POINTS:
-            seen = points.positions[in_view(c, points.positions)]
+        # All points in the picture, also those matched elsewhere: far background is rarely matched in every view.
+        seen = points.positions[in_view(c, points.positions)]
         if bounded or len(seen) < LEAST_POINTS:
             ranges.append((near_box, far_box))
             continue
