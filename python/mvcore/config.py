@@ -87,7 +87,7 @@ class VolumeConfig:
 
     voxel: float | None = None
     """World units; by default `footprints` pixel footprints of the target."""
-    footprints: float = 1.5
+    footprints: float = 1.35
     """Pixel footprints a voxel: below 1 there is nothing to resolve, above 1.5 detail is lost."""
     truncation: float = 4.0
     """Voxels on either side of a surface that carry its distance."""
