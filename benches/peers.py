@@ -78,6 +78,8 @@ def fusion():
     ours, volume = median(lambda: fuse(maps, cameras, bounds, config=VolumeConfig(voxel=voxel)))
 
     def error(vertices):
+        if not len(vertices):
+            return "no surface: not comparable"
         return f"mean error {np.abs(np.linalg.norm(vertices, axis=1) - 1).mean() / voxel:.3f} voxel"
 
     line("mvcore fuse", ours, ours, error(isosurface(volume).vertices))
