@@ -97,7 +97,7 @@ class VolumeConfig:
     """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
     solid_weight: float = 3.0
     """With masks: weight of observations that overrules the solid inside of the hull: more than a few wrong views have."""
-    hull_tolerance: float = 0.03
+    hull_tolerance: float = 0.05
     """Share of the silhouettes that may disagree: one wrong mask among many does no harm."""
     max_memory: int = 4 << 30
     """Bytes of the volume; the voxels grow until it fits, and the report says so."""
