@@ -26,25 +26,26 @@ def tsdf(grid_points, depths, cameras, truncation, free_weight):
 
 
 def consistency(depth, others, cameras, pixel_unit, depth_unit, min_views):
-    """The dynamic rule on constant-depth-per-pixel maps, nearest sampling; ``cameras[0]`` is the reference's."""
+    """The dynamic rule and the majority of the witnesses, nearest sampling; ``cameras[0]`` is the reference's."""
     reference = cameras[0]
-    h, w = depth.shape
     kept = np.zeros_like(depth)
-    for y in range(h):
-        for x in range(w):
-            z = depth[y, x]
-            if z <= 0:
+    for y, x in zip(*np.nonzero(depth > 0)):
+        z = depth[y, x]
+        point = reference.unproject([[x, y]], [z])
+        votes = []
+        for other, c in zip(others, cameras[1:]):
+            q = c.project(point)[0]
+            i = np.rint(q).astype(int)
+            if not (0 <= q[0] <= c.width - 1 and 0 <= q[1] <= c.height - 1) or other[i[1], i[0]] <= 0:
                 continue
-            votes = []
-            for other, c in zip(others, cameras[1:]):
-                p = reference.unproject([[x, y]], [z])
-                q = c.project(p)[0]
-                i = np.rint(q).astype(int)
-                if not (0 <= q[0] <= c.width - 1 and 0 <= q[1] <= c.height - 1) or other[i[1], i[0]] <= 0:
-                    continue
-                back = reference.to_camera(c.unproject([q], [other[i[1], i[0]]]))[0]
-                pixel = reference.project(reference.unproject([[x, y]], [z]) * 0 + c.unproject([q], [other[i[1], i[0]]]))[0]
-                votes.append(max(np.hypot(*(pixel - [x, y])) / pixel_unit, abs(back[2] - z) / (z * depth_unit)))
-            if any(sum(v < n for v in votes) >= n for n in range(min_views, 11)):
-                kept[y, x] = z
+            there = other[i[1], i[0]]
+            if there < 0.99 * c.to_camera(point)[0, 2]:
+                continue  # its surface hides the point
+            surface = c.unproject([q], [there])
+            pixels = np.hypot(*(reference.project(surface)[0] - [x, y]))
+            votes.append(max(pixels / pixel_unit, abs(reference.to_camera(surface)[0, 2] - z) / (z * depth_unit)))
+        rule = any(sum(v < n for v in votes) >= n for n in range(min_views, 11))
+        agreeing = sum(v < 3 for v in votes)
+        if rule or (agreeing >= min_views and 2 * agreeing >= len(votes)):
+            kept[y, x] = z
     return kept

@@ -144,7 +144,8 @@ def test_consistency_equals_its_twin():
         kept, _ = _core.consistency(maps[0], maps[1:], there, back, min_views, 0.5, 0.05)
         twin = reference.consistency(maps[0], maps[1:], cameras, 0.5, 0.05, min_views)
         same = (kept > 0) == (twin > 0)
-        assert same.mean() > 0.97  # four equal taps are interpolated, which moves nothing; rounding may differ at ties
+        assert same.mean() > 0.99  # rounding decides a pixel or two at ties
+        assert 0.1 < (kept > 0).mean() < 0.9
 
 
 def test_fusion_equals_its_twin(ring):
