@@ -121,6 +121,7 @@ const FUSION: FusionParams = FusionParams {
     free_weight: 0.3,
     min_weight: 0.05,
     solid_weight: 0.5,
+    smoothing: 0.0,
     hull_tolerance: 0.05,
     max_memory: 4 << 30,
 };

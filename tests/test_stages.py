@@ -30,7 +30,7 @@ from mvcore.sparse import (
 from mvcore.surface import Surface, decimate, drop_small_parts, extract_surface, marching_cubes, smooth
 from mvcore.texture import colour_gains, texture
 from mvcore.types import DepthMap, Report
-from mvcore.volume import Volume, fuse, silhouette_distance
+from mvcore.volume import Volume, fuse, repaired_masks, silhouette_distance
 
 
 def test_unknown_settings_name_the_nearest():
@@ -152,7 +152,7 @@ def test_fusion_equals_its_twin(ring):
     cameras, _, depths, _ = ring
     maps = [DepthMap(d.astype(np.float32), np.ones(d.shape, np.float32)) for d in depths]
     bounds = np.array([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
-    config = VolumeConfig(voxel=0.03, free_weight=0.5, min_weight=0.0)
+    config = VolumeConfig(voxel=0.03, free_weight=0.5, min_weight=0.0, truncation=4.0, smoothing=0.0)
     volume = fuse(maps, cameras, bounds, config=config)
     local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), -1).reshape(-1, 3)
     points = volume.origin + volume.voxel * (volume.coords[:, None].astype(float) * 8 + local).reshape(-1, 3)
@@ -176,6 +176,22 @@ def test_silhouettes_alone_give_the_hull(ring):
     radius = np.linalg.norm(surface.vertices, axis=1)
     assert radius.min() > 0.48
     assert np.median(radius) < 0.53
+
+
+def test_an_occluder_in_a_mask_is_found_by_the_other_views_depth(ring):
+    cameras, _, depths, masks = ring
+    maps = [DepthMap(d.astype(np.float32), np.ones(d.shape, np.float32)) for d in depths]
+    cut = [(m * 255).astype(np.uint8) for m in masks]
+    whole = cut[0].copy()
+    y, x = (int(v.mean()) for v in np.nonzero(whole))
+    half = max(12, int(0.25 * np.sqrt(whole.astype(bool).sum())))
+    cut[0][y - half : y + half, x - half : x + half] = 0
+    maps[0] = DepthMap(np.where(cut[0] > 0, maps[0].depth, 0).astype(np.float32), maps[0].confidence)
+    repaired = repaired_masks(maps, cameras, cut)
+    lost = (whole > 0) & (cut[0] == 0)
+    assert (repaired[0] > 0)[lost].mean() > 0.9
+    assert (repaired[0] > 0)[whole == 0].mean() < 0.01
+    assert all(((r > 0) == (m > 0)).all() for r, m in zip(repaired[1:], cut[1:]))
 
 
 def test_silhouette_distance_is_signed_pixels():

@@ -21,6 +21,7 @@ __all__ = [
     "read_obj",
     "refine",
     "select_views",
+    "shade",
     "sweep",
 ]
 
@@ -72,6 +73,7 @@ def fuse(
     free_weight: float,
     min_weight: float,
     solid_weight: float,
+    smoothing: float,
     hull_tolerance: float,
     max_memory: int,
 ) -> tuple[_U32, _F32]: ...
@@ -89,6 +91,20 @@ def match_epipolar(
     ratio: float,
 ) -> _U32: ...
 def rasterize(vertices: _F64, faces: _U32, matrix: _F64, width: int, height: int) -> tuple[_F32, _I32]: ...
+def shade(
+    vertices: _F64,
+    faces: _U32,
+    uv: _F32,
+    normals: _F32,
+    materials: NDArray[np.uint16],
+    textures: _U8,
+    gloss: _F32,
+    matrix: _F64,
+    lamp: Sequence[float],
+    width: int,
+    height: int,
+    samples: int = 2,
+) -> _U8: ...
 def rate_faces(
     vertices: _F64,
     faces: _U32,

@@ -230,7 +230,7 @@ def demo(
         sample = Path(__file__).parent / "sample"
         if not (sample / "cameras.json").is_file():
             raise FileNotFoundError(f"{sample}: the bundled sample is not installed")
-        reconstruct(sample, output / "pickup.glb", report=output / "report.json", save_depth=output / "depth")
+        reconstruct(sample, output / "pickup.glb", masks=sample / "masks", report=output / "report.json", save_depth=output / "depth")
 
 
 def main() -> None:

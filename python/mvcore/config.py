@@ -75,10 +75,17 @@ class DepthConfig:
     """Rounds at half the size once the other views' depth is known."""
     min_views: int = 1
     """Fewest other views that must agree with a depth, at the tightest tolerance."""
-    pixel_unit: float = 0.5
+    pixel_unit: float = 0.25
     """Pixels of reprojection error allowed per agreeing view."""
-    depth_unit: float = 1.0 / 600.0
+    depth_unit: float = 1.0 / 1200.0
     """Relative depth error allowed per agreeing view."""
+    fusion_units: float = 2.15
+    """Times these tolerances a depth may err and still be fused: many views average what one must not show alone."""
+
+    def loosened(self) -> DepthConfig:
+        """With the tolerances that fusion takes."""
+        k = self.fusion_units
+        return dataclasses.replace(self, pixel_unit=k * self.pixel_unit, depth_unit=k * self.depth_unit)
 
 
 @dataclass(frozen=True)
@@ -89,16 +96,20 @@ class VolumeConfig:
     """World units; by default `footprints` pixel footprints of the target."""
     footprints: float = 1.35
     """Pixel footprints a voxel: below 1 there is nothing to resolve, above 1.5 detail is lost."""
-    truncation: float = 4.0
+    truncation: float = 5.0
     """Voxels on either side of a surface that carry its distance."""
     free_weight: float = 0.3
     """Weight of seeing through a voxel against seeing a surface there."""
     min_weight: float = 0.05
     """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
-    solid_weight: float = 3.0
-    """With masks: weight of observations that overrules the solid inside of the hull: more than a few wrong views have."""
-    hull_tolerance: float = 0.05
-    """Share of the silhouettes that may disagree: one wrong mask among many does no harm."""
+    solid_share: float = 0.05
+    """With masks: weight of observations, a view, that overrules the solid inside of the hull: more than a few wrong views have."""
+    smoothing: float = 0.7
+    """Voxels: standard deviation of the field's smoothing without masks."""
+    solid_smoothing: float = 2.0
+    """With masks: where depth is known here and not there, the solid inside of the hull would leave crumbs."""
+    hull_tolerance: float = 0.04
+    """Share of the silhouettes that may disagree: one wrong mask among 25 does no harm; with fewer views each is needed."""
     max_memory: int = 4 << 30
     """Bytes of the volume; the voxels grow until it fits, and the report says so."""
 

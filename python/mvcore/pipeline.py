@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import depth as depth_stage
 from . import sparse as sparse_stage
 from .cameras import Calibration, Camera
-from .config import Config
+from .config import Config, DepthConfig
 from .depth import View
 from .errors import ReconstructionError, require
 from .io import load
@@ -141,9 +141,11 @@ def reconstruct(
     with clock.stage("depth"):
         depths = _depths(images, cameras, sources, ranges, config, track)
     with clock.stage("consistency"):
-        filtered = _filtered(depths, cameras, sources, cut, config, report, track)
+        filtered = _filtered(depths, cameras, sources, cut, config.depth, track)
+        fused = _filtered(depths, cameras, sources, cut, config.depth.loosened(), track)
+        _say_kept(filtered, sources, cut is not None, report)
     with clock.stage("volume"):
-        views = [d if d is not None else _nothing(c) for d, c in zip(filtered, cameras, strict=True)]
+        views = [d if d is not None else _nothing(c) for d, c in zip(fused, cameras, strict=True)]
         volume = fuse(views, cameras, box, cut, config.volume, report)
     with clock.stage("surface"):
         surface = extract_surface(volume, config.surface, solid=cut is not None)
@@ -212,29 +214,29 @@ def _filtered(
     cameras: Sequence[Camera],
     sources: list[list[int]],
     masks: Masks | None,
-    config: Config,
-    report: Report,
+    config: DepthConfig,
     track: Track,
 ) -> list[DepthMap | None]:
+    """What other views agree with, inside the masks."""
     known = [d if d is not None else _nothing(c) for d, c in zip(depths, cameras, strict=True)]
     out: list[DepthMap | None] = []
-    shares: list[float | None] = []
     for n in track(range(len(known)), "consistency", len(known)):
         if depths[n] is None:
             out.append(None)
-            shares.append(None)
             continue
-        kept, _ = depth_stage.filter_depth(n, known, cameras, sources[n], config.depth)
+        kept, _ = depth_stage.filter_depth(n, known, cameras, sources[n], config)
         if masks is not None:
-            inside = masks[n] > 0
-            kept = DepthMap(np.where(inside, kept.depth, 0).astype(np.float32), kept.confidence)
+            kept = DepthMap(np.where(masks[n] > 0, kept.depth, 0).astype(np.float32), kept.confidence)
         out.append(kept)
-        shares.append(round(float((kept.depth > 0).mean()), 4))
+    return out
+
+
+def _say_kept(filtered: list[DepthMap | None], sources: list[list[int]], masked: bool, report: Report) -> None:
+    shares = [None if d is None else round(float((d.depth > 0).mean()), 4) for d in filtered]
     report.values["depth"] = {"kept_share": shares, "sources": sources}
     poor = [n for n, s in enumerate(shares) if s is not None and s < 0.01]
-    if poor and masks is None:
+    if poor and not masked:
         report.warn(f"views {poor} contribute almost nothing: less than 1 % of their depth agrees with other views")
-    return out
 
 
 def _peak_memory() -> int:

@@ -70,6 +70,58 @@ def silhouette_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
 
 
+POINT_STEP = 2
+"""Pixels between the points that `repaired_masks` projects."""
+REACH = 9
+"""Pixels over which their density is measured, and gaps between them closed."""
+
+
+def repaired_masks(depths: Sequence[DepthMap], cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    """Masks with what other views' depth contradicts filled in: an occluder cuts a silhouette without cutting the target.
+
+    Surface points that the other views agree on and that fall densely outside a mask mean that something stands before them there.
+    Stray points along a silhouette are too thin to count; so is everything where no depth is known.
+
+    Parameters
+    ----------
+    depths : filtered depth maps of the target, one a camera. masks : (h, w) uint8, non-zero on the target.
+    """
+    points = []
+    for view, camera in zip(depths, cameras, strict=True):
+        y, x = np.nonzero(view.depth[::POINT_STEP, ::POINT_STEP])
+        pixels = np.column_stack([x, y]) * POINT_STEP
+        points.append(camera.unproject(pixels, view.depth[pixels[:, 1], pixels[:, 0]]))
+    return [_repaired(m, c, [p for k, p in enumerate(points) if k != n]) for n, (m, c) in enumerate(zip(masks, cameras, strict=True))]
+
+
+def _repaired(mask: NDArray[np.uint8], camera: Camera, points: list[NDArray[np.float64]]) -> NDArray[np.uint8]:
+    inside = (mask > 0).astype(np.uint8)
+    hits = np.zeros(mask.shape, np.float32)
+    for cloud in points:
+        q = camera.to_camera(cloud)
+        q = q[q[:, 2] > 0] @ camera.K.T
+        x = np.rint(q[:, :2] / q[:, 2:]).astype(int)
+        x = x[((x >= 0) & (x < (camera.width, camera.height))).all(1)]
+        # Each view counts once at a pixel.
+        seen = np.zeros(mask.shape, np.float32)
+        seen[x[:, 1], x[:, 0]] = 1
+        hits += seen
+    # A surface that one view sees squarely has one point a step squared; more than one view must have seen it.
+    density = cv2.boxFilter(np.where(inside > 0, 0, hits).astype(np.float32), -1, (REACH, REACH)) * POINT_STEP**2
+    share = cv2.boxFilter(1.0 - inside.astype(np.float32), -1, (REACH, REACH))
+    doubted = ((density > 1.2 * share) & (inside == 0)).astype(np.uint8)
+    small, large = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (n, n)) for n in (REACH, 2 * REACH + 1))
+    solid = cv2.morphologyEx(cv2.morphologyEx(doubted, cv2.MORPH_CLOSE, small), cv2.MORPH_OPEN, large)
+    if not solid.any():
+        return inside
+    # What hangs on it in slits of the mask, a post say, and the rim between it and the mask.
+    slits = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, small) & doubted
+    _, part = cv2.connectedComponents(solid | slits)
+    filled = inside | solid | (np.isin(part, np.unique(part[solid > 0])) & (slits > 0)).astype(np.uint8)
+    around = cv2.dilate(solid, small, iterations=2)
+    return filled | (cv2.morphologyEx(filled, cv2.MORPH_CLOSE, small) & around)
+
+
 def fuse(
     depths: Sequence[DepthMap],
     cameras: Sequence[Camera],
@@ -95,7 +147,7 @@ def fuse(
     bounds = np.asarray(bounds, np.float64)
     voxel = target_voxel(cameras, depths, bounds, config)
     weights = [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)]
-    silhouettes = None if masks is None else [silhouette_distance(m) for m in masks]
+    silhouettes = None if masks is None else [silhouette_distance(m) for m in repaired_masks(depths, cameras, masks)]
     wanted = voxel
     while True:
         origin = bounds[0] - 2 * voxel
@@ -112,7 +164,8 @@ def fuse(
                 truncation=config.truncation * voxel,
                 free_weight=config.free_weight,
                 min_weight=config.min_weight,
-                solid_weight=config.solid_weight,
+                solid_weight=config.solid_share * len(cameras),
+                smoothing=config.smoothing if masks is None else config.solid_smoothing,
                 hull_tolerance=config.hull_tolerance,
                 max_memory=config.max_memory,
             )
@@ -129,6 +182,8 @@ def fuse(
 
 def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
     distance = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), 1e-9)
-    with np.errstate(divide="ignore"):
-        nearer = np.where(view.depth > 0, distance / np.maximum(view.depth, 1e-12), 0)
-    return (view.confidence * np.clip(nearer, 0.1, 2.0) ** 4).astype(np.float32)
+    # No depth is a distance of zero here: its weight is never asked for.
+    nearer = np.clip(np.float32(distance) / np.maximum(view.depth, np.float32(1e-6 * distance)), 0.1, 2.0)
+    np.square(nearer, out=nearer)
+    np.square(nearer, out=nearer)
+    return np.multiply(nearer, view.confidence, out=nearer)

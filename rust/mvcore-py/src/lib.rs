@@ -18,7 +18,7 @@ mod _core {
     #[pymodule_export]
     use crate::sparse::match_epipolar;
     #[pymodule_export]
-    use crate::texture::{build_atlas, rasterize, rate_faces, select_views};
+    use crate::texture::{build_atlas, rasterize, rate_faces, select_views, shade};
     #[pymodule_export]
     use crate::volume::{components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest_distance};
 }

@@ -5,8 +5,10 @@ use mvcore::atlas::Source;
 use mvcore::mesh::Mesh;
 use mvcore::raster::Raster;
 use mvcore::select_views::{Photo, Rating, SelectParams};
+use mvcore::shade::{Shot, Surface};
 use numpy::{
-    PyArray1, PyArray2, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+    PyArray1, PyArray2, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
+    PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -119,4 +121,45 @@ pub fn build_atlas<'py>(
         array(py, t.faces.into_flattened(), [count, 3])?,
         array(py, t.atlas, [t.height, t.width, 3])?,
     ))
+}
+
+#[pyfunction]
+#[pyo3(signature = (vertices, faces, uv, normals, materials, textures, gloss, matrix, lamp, width, height, samples = 2))]
+pub fn shade<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    uv: PyReadonlyArray2<'py, f32>,
+    normals: PyReadonlyArray2<'py, f32>,
+    materials: PyReadonlyArray1<'py, u16>,
+    textures: PyReadonlyArray4<'py, u8>,
+    gloss: PyReadonlyArray2<'py, f32>,
+    matrix: PyReadonlyArray2<'py, f64>,
+    lamp: [f64; 3],
+    width: usize,
+    height: usize,
+    samples: usize,
+) -> PyResult<Bound<'py, PyArray3<u8>>> {
+    let ((v, f), projection) = (mesh(&vertices, &faces)?, projection(&matrix)?);
+    let size = textures.shape()[1];
+    if uv.shape()[1] != 2
+        || normals.shape()[1] != 3
+        || gloss.shape()[1] != 4
+        || textures.shape()[1..] != [size, size, 3]
+    {
+        return Err(PyValueError::new_err(
+            "uv, normals, gloss, textures: expected shapes (n, 2), (n, 3), (m, 4), (m, s, s, 3)",
+        ));
+    }
+    let surface = Surface {
+        uv: slice(&uv, "uv")?.as_chunks::<2>().0,
+        normals: slice(&normals, "normals")?.as_chunks::<3>().0,
+        materials: slice(&materials, "materials")?,
+        textures: slice(&textures, "textures")?,
+        size,
+        gloss: slice(&gloss, "gloss")?.as_chunks::<4>().0,
+    };
+    let shot = Shot { projection, lamp, width, height, samples };
+    let image = run(py, || mvcore::shade::shade(Mesh::new(v, f)?, surface, &shot))?;
+    array(py, image, [height, width, 3])
 }

@@ -36,7 +36,7 @@ pub fn consistency<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, projections, *, truncation, free_weight, min_weight, solid_weight, hull_tolerance, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, projections, *, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -50,6 +50,7 @@ pub fn fuse<'py>(
     free_weight: f32,
     min_weight: f32,
     solid_weight: f32,
+    smoothing: f32,
     hull_tolerance: f32,
     max_memory: usize,
 ) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray4<f32>>)> {
@@ -71,7 +72,8 @@ pub fn fuse<'py>(
             focal: (p[(v, 0, 0)].powi(2) + p[(v, 0, 1)].powi(2) + p[(v, 0, 2)].powi(2)).sqrt().max(1e-9),
         })
         .collect();
-    let params = FusionParams { truncation, free_weight, min_weight, solid_weight, hull_tolerance, max_memory };
+    let params =
+        FusionParams { truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory };
     let volume = run(py, || mvcore::fuse::fuse(Grid::new(origin, voxel, shape)?, &views, &params))?;
     let count = volume.map.coords.len();
     Ok((

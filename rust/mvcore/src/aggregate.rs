@@ -12,6 +12,7 @@
 //! intensity step (his eq 13). The order of operations is fixed: the same bytes for any thread count.
 
 use crate::error::{Result, require};
+use crate::memory::zeroed;
 use crate::raster::Raster;
 use multiversion::multiversion;
 
@@ -47,8 +48,8 @@ pub fn aggregate(costs: &[u8], planes: usize, guide: Raster<u8>, penalties: Pena
     )?;
     let Penalties { p1, p2, .. } = penalties;
     require(p1 <= p2 && p2 <= 120, "penalties", "p1 <= p2 <= 120", format!("p1 {p1}, p2 {p2}"))?;
-    let mut winners = Winners { plane: vec![0.0; w * h], margin: vec![0.0; w * h] };
-    let mut sums = vec![0u16; w * h * planes]; // zero pages: first touched by the pass that writes them
+    let mut winners = Winners { plane: zeroed(w * h), margin: zeroed(w * h) };
+    let mut sums = zeroed::<u16>(w * h * planes); // first touched by the pass that writes them
     let top = h / 2;
     let (sums_top, sums_bottom) = sums.split_at_mut(top * w * planes);
     let (plane_top, plane_bottom) = winners.plane.split_at_mut(top * w);

@@ -11,6 +11,7 @@
 
 use crate::error::{Error, Result, require};
 use crate::grid::{BLOCK, BlockMap, Grid, SIDE};
+use crate::memory::zeroed;
 use crate::raster::Raster;
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -40,6 +41,8 @@ pub struct FusionParams {
     pub free_weight: f32,
     /// Weight of surface observations below which a voxel is not inside; free space needs none.
     pub min_weight: f32,
+    /// Standard deviation of the field's smoothing in voxels, 0 for none.
+    pub smoothing: f32,
     /// With silhouettes: weight of observations that overrules the solid inside of the hull.
     pub solid_weight: f32,
     /// Share of the silhouettes that see a voxel and may disagree with its being inside.
@@ -92,10 +95,15 @@ pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<V
     if needed > params.max_memory {
         return Err(Error::OutOfMemory { what: "volume", needed, allowed: params.max_memory });
     }
-    let mut values = vec![f32::NAN; map.coords.len() * BLOCK];
+    let mut values = zeroed::<f32>(map.coords.len() * BLOCK);
+    let tiles: Vec<Tiles> = views.par_iter().map(|v| Tiles::of(v.depth)).collect();
     values.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).for_each(|(out, at)| {
-        integrate(&grid, *at, views, params, masked, out);
+        integrate(&grid, *at, views, &tiles, params, masked, out);
     });
+    if params.smoothing > 0.0 {
+        // With silhouettes what no block covers is outside the hull.
+        values = smoothed(&values, &map, params.smoothing, masked.then_some(1.0));
+    }
     Ok(Volume { map, values })
 }
 
@@ -215,19 +223,67 @@ impl Stepper {
         Self { base: std::array::from_fn(|r| row(r) as f32), di: column(0), dj: column(1), dk: column(2) }
     }
 
-    /// Whether no voxel of the block can fall on the image.
-    fn misses(&self, width: usize, height: usize) -> bool {
-        let corner = |c: usize, r: usize| {
+    /// Whether the view says nothing of the block: it falls off the image, or lies more than τ behind all that is seen there.
+    fn misses(&self, tiles: &Tiles, truncation: f32) -> bool {
+        let corner = |c: usize| -> [f32; 3] {
             let f = |bit: usize| if c >> bit & 1 == 1 { (SIDE - 1) as f32 } else { 0.0 };
-            self.base[r] + f(0) * self.di[r] + f(1) * self.dj[r] + f(2) * self.dk[r]
+            std::array::from_fn(|r| self.base[r] + f(0) * self.di[r] + f(1) * self.dj[r] + f(2) * self.dk[r])
         };
-        let all = |test: &dyn Fn(f32, f32, f32) -> bool| (0..8).all(|c| test(corner(c, 0), corner(c, 1), corner(c, 2)));
-        all(&|_, _, z| z <= 0.0)
-            || (all(&|_, _, z| z > 0.0)
-                && (all(&|x, _, z| x < -0.5 * z)
-                    || all(&|_, y, z| y < -0.5 * z)
-                    || all(&|x, _, z| x > (width as f32 - 0.5) * z)
-                    || all(&|_, y, z| y > (height as f32 - 0.5) * z)))
+        let (mut low, mut high) = ([f32::MAX; 3], [f32::MIN; 3]);
+        for [x, y, z] in std::array::from_fn::<_, 8, _>(corner) {
+            // A corner behind the camera has no pixel: only a block wholly behind it is known to miss.
+            let p = if z > 0.0 { [x / z, y / z, z] } else { [f32::NAN, f32::NAN, z] };
+            for a in 0..3 {
+                low[a] = if p[a] >= low[a] { low[a] } else { p[a] };
+                high[a] = if p[a] <= high[a] { high[a] } else { p[a] };
+            }
+        }
+        if high[2] <= 0.0 {
+            return true;
+        }
+        if low[2] <= 0.0 {
+            return false;
+        }
+        let (width, height) = (tiles.width as f32, tiles.height as f32);
+        low[0] > width - 0.5
+            || high[0] < -0.5
+            || low[1] > height - 0.5
+            || high[1] < -0.5
+            || low[2] - truncation > tiles.deepest([low[0], low[1]], [high[0], high[1]])
+    }
+}
+
+/// The greatest depth of each tile of a depth map.
+struct Tiles {
+    width: usize,
+    height: usize,
+    across: usize,
+    depth: Vec<f32>,
+}
+
+/// Pixels along a tile's side.
+const TILE: usize = 16;
+
+impl Tiles {
+    fn of(depth: Raster<f32>) -> Self {
+        let (width, height) = (depth.width, depth.height);
+        let across = width.div_ceil(TILE);
+        let mut most = vec![0.0f32; across * height.div_ceil(TILE)];
+        for y in 0..height {
+            for (x, strip) in depth.row(y).chunks(TILE).enumerate() {
+                let m = &mut most[y / TILE * across + x];
+                *m = strip.iter().copied().fold(*m, f32::max);
+            }
+        }
+        Self { width, height, across, depth: most }
+    }
+
+    /// The greatest depth among the tiles under a box of pixels, one pixel wider for interpolation.
+    fn deepest(&self, low: [f32; 2], high: [f32; 2]) -> f32 {
+        let tile = |p: f32, size: usize| (p.max(0.0) as usize).min(size - 1) / TILE;
+        let (x0, x1) = (tile(low[0] - 1.0, self.width), tile(high[0] + 1.5, self.width));
+        let (y0, y1) = (tile(low[1] - 1.0, self.height), tile(high[1] + 1.5, self.height));
+        (y0..=y1).flat_map(|y| &self.depth[y * self.across + x0..=y * self.across + x1]).copied().fold(0.0, f32::max)
     }
 }
 
@@ -236,14 +292,22 @@ impl Stepper {
     "x86_64+avx2+fma+bmi2",
     "aarch64+neon"
 ))]
-fn integrate(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionParams, masked: bool, out: &mut [f32]) {
+fn integrate(
+    grid: &Grid,
+    at: [u32; 3],
+    views: &[FusionView],
+    tiles: &[Tiles],
+    params: &FusionParams,
+    masked: bool,
+    out: &mut [f32],
+) {
     let inverse_truncation = (1.0 / params.truncation) as f32;
     let mut sum = [0.0f32; BLOCK];
     let mut total = [0.0f32; BLOCK];
     let mut near = [0.0f32; BLOCK];
-    for view in views {
+    for (view, tiles) in views.iter().zip(tiles) {
         let stepper = Stepper::new(grid, at, &view.projection);
-        if stepper.misses(view.depth.width, view.depth.height) {
+        if stepper.misses(tiles, params.truncation as f32) {
             continue;
         }
         let rows = sum.as_chunks_mut::<SIDE>().0.iter_mut();
@@ -341,6 +405,97 @@ fn sample(view: &FusionView, u: f32, v: f32, z: f32, inverse_truncation: f32) ->
     (top + b * (r + a * (s - r) - top), weight)
 }
 
+/// Voxels beyond a block's sides that its smoothing reads; the kernel ends there.
+const HALO: usize = 4;
+/// Weight of truncated values in the smoothing of an open surface.
+const FAR_WEIGHT: f32 = 0.1;
+const WIDE: usize = SIDE + 2 * HALO;
+
+/// A Gaussian mean of the known voxels around each known one: normalised convolution, axis by axis. `beyond` fills missing blocks.
+fn smoothed(values: &[f32], map: &BlockMap, sigma: f32, beyond: Option<f32>) -> Vec<f32> {
+    let taps: [f32; 2 * HALO + 1] = std::array::from_fn(|k| (-0.5 * ((k as f32 - HALO as f32) / sigma).powi(2)).exp());
+    // Open surfaces have free space on one side and nothing behind: far values must not outweigh the surface's own.
+    let least = if beyond.is_some() { 1.0 } else { FAR_WEIGHT };
+    let mut out = zeroed::<f32>(values.len());
+    out.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).enumerate().for_each_init(
+        || vec![[0.0f32; 2]; WIDE * WIDE * WIDE],
+        |wide, (slot, (out, at))| {
+            wide.fill(beyond.map_or([0.0; 2], |v| [v, 1.0]));
+            gather(values, map, *at, least, wide);
+            smooth_block(wide, &taps, &values[slot * BLOCK..][..BLOCK], out);
+        },
+    );
+    out
+}
+
+/// Puts a block with its surroundings into a wide one as (value, 1), and (0, 0) where nothing is known.
+fn gather(values: &[f32], map: &BlockMap, at: [u32; 3], least: f32, wide: &mut [[f32; 2]]) {
+    for n in 0..27 {
+        let step = [n / 9, n / 3 % 3, n % 3];
+        let block = [0, 1, 2].map(|a| (at[a] as usize + step[a]).wrapping_sub(1));
+        let slot = map.at(block[0], block[1], block[2]);
+        if slot == crate::grid::NONE {
+            continue;
+        }
+        let from = &values[slot as usize * BLOCK..][..BLOCK];
+        // In the wide block this neighbour starts at HALO + (step - 1)·SIDE; only what lies inside is copied.
+        let range = |a: usize| {
+            let start = (HALO + step[a] * SIDE) as i32 - SIDE as i32;
+            ((-start).max(0) as usize..(WIDE as i32 - start).min(SIDE as i32) as usize, start)
+        };
+        let ((ri, si), (rj, sj), (rk, sk)) = (range(0), range(1), range(2));
+        for i in ri {
+            for j in rj.clone() {
+                let row = ((i as i32 + si) as usize * WIDE + (j as i32 + sj) as usize) * WIDE;
+                for k in rk.clone() {
+                    let v = from[(i * SIDE + j) * SIDE + k];
+                    let weight = if v.is_nan() { 0.0 } else { (1.0 - v * v).max(least) };
+                    wide[row + (k as i32 + sk) as usize] = [weight * v.max(-1.0), weight];
+                }
+            }
+        }
+    }
+}
+
+#[multiversion(targets(
+    "x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma+bmi2",
+    "x86_64+avx2+fma+bmi2",
+    "aarch64+neon"
+))]
+fn smooth_block(wide: &[[f32; 2]], taps: &[f32; 2 * HALO + 1], values: &[f32], out: &mut [f32]) {
+    const SLAB: usize = WIDE * WIDE;
+    let mut x = [[0.0f32; 2]; SIDE * SLAB];
+    for i in 0..SIDE {
+        let to = &mut x[i * SLAB..][..SLAB];
+        for (tap, &weight) in taps.iter().enumerate() {
+            for (o, v) in to.iter_mut().zip(&wide[(i + tap) * SLAB..][..SLAB]) {
+                o[0] += weight * v[0];
+                o[1] += weight * v[1];
+            }
+        }
+    }
+    let mut y = [[0.0f32; 2]; SIDE * SIDE * WIDE];
+    for row in 0..SIDE * SIDE {
+        let (i, j) = (row / SIDE, row % SIDE);
+        let to = &mut y[row * WIDE..][..WIDE];
+        for (tap, &weight) in taps.iter().enumerate() {
+            for (o, v) in to.iter_mut().zip(&x[i * SLAB + (j + tap) * WIDE..][..WIDE]) {
+                o[0] += weight * v[0];
+                o[1] += weight * v[1];
+            }
+        }
+    }
+    for n in 0..BLOCK {
+        let line = &y[n / SIDE * WIDE + n % SIDE..][..2 * HALO + 1];
+        let (mut sum, mut total) = (0.0, 0.0);
+        for (v, &weight) in line.iter().zip(taps) {
+            sum += weight * v[0];
+            total += weight * v[1];
+        }
+        out[n] = if values[n].is_nan() { f32::NAN } else { sum / total };
+    }
+}
+
 fn cut_by_hull(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionParams, out: &mut [f32]) {
     let inverse = (1.0 / params.truncation) as f32;
     for (n, v) in out.iter_mut().enumerate() {
@@ -366,6 +521,7 @@ mod tests {
         free_weight: 1.0,
         min_weight: 0.0,
         solid_weight: 0.5,
+        smoothing: 0.0,
         hull_tolerance: 0.0,
         max_memory: 1 << 30,
     };
@@ -420,6 +576,22 @@ mod tests {
         };
         assert!(value(20, 20, 20) < -0.9);
         assert!(value(20, 29, 20) > 0.0); // 0.45 to the side: 6.75 px
+    }
+
+    #[test]
+    fn smoothing_keeps_a_slope_and_mends_a_speck() {
+        let map = BlockMap::from_flags([2, 2, 2], std::iter::repeat_n(true, 8));
+        let ramp = |slot: usize, n: usize| ((map.coords[slot][0] as usize * SIDE + n / 64) as f32 - 7.5) / 16.0;
+        let mut values: Vec<f32> = (0..8 * BLOCK).map(|n| ramp(n / BLOCK, n % BLOCK)).collect();
+        let speck = 7 * BLOCK + 3 * 64 + 3 * 8 + 3;
+        let unknown = BLOCK + 5;
+        (values[speck], values[unknown]) = (-0.9, f32::NAN);
+        let smooth = smoothed(&values, &map, 1.0, None);
+        assert!(smooth[unknown].is_nan());
+        assert!((smooth[speck] - 3.5 / 16.0).abs() < 0.15, "{}", smooth[speck]);
+        // Away from the speck and the ends of the ramp the slope is kept.
+        let away = 4 * 64; // slot 0, i = 4
+        assert!((smooth[away] - values[away]).abs() < 1e-2);
     }
 
     #[test]

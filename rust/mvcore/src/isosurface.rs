@@ -14,6 +14,7 @@
 use crate::cube::{EDGES, TRIANGLES};
 use crate::error::Result;
 use crate::grid::{BLOCK, BlockMap, Grid, NONE, SIDE};
+use crate::memory::zeroed;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -56,8 +57,8 @@ pub fn isosurface_sparse(map: &BlockMap, values: &[f32]) -> Result<Surface> {
 trait Samples: Sync {
     /// Sample (i, j, k) of the block, all below [`SIDE`].
     fn get(&self, slot: usize, at: [u32; 3], local: [usize; 3]) -> f32;
-    /// Signs (1: negative) and validity (1: not NaN), one word a slice, bit j·8 + k.
-    fn words(&self, slot: usize, at: [u32; 3]) -> ([u64; SIDE], [u64; SIDE]);
+    /// The bits of all blocks of the map.
+    fn bits(&self, map: &BlockMap) -> Vec<Bits>;
 }
 
 struct Sparse<'a> {
@@ -70,14 +71,14 @@ impl Samples for Sparse<'_> {
         self.values[slot * BLOCK + (l[0] * SIDE + l[1]) * SIDE + l[2]]
     }
 
-    fn words(&self, slot: usize, _: [u32; 3]) -> ([u64; SIDE], [u64; SIDE]) {
-        let (mut sign, mut valid) = ([0; SIDE], [0; SIDE]);
-        for (row, v) in self.values[slot * BLOCK..][..BLOCK].as_chunks::<SIDE>().0.iter().enumerate() {
-            let (s, ok) = row_bits(v);
-            sign[row / SIDE] |= s << (row % SIDE * SIDE);
-            valid[row / SIDE] |= ok << (row % SIDE * SIDE);
-        }
-        (sign, valid)
+    fn bits(&self, map: &BlockMap) -> Vec<Bits> {
+        let mut bits = zeroed::<Bits>(map.coords.len());
+        bits.par_iter_mut().zip(self.values.par_chunks_exact(BLOCK)).for_each(|(out, values)| {
+            for (row, v) in values.chunks_exact(SIDE).enumerate() {
+                row_bits(v, row, std::slice::from_mut(out));
+            }
+        });
+        bits
     }
 }
 
@@ -93,44 +94,72 @@ impl Samples for Dense<'_> {
         self.values[(p[0] * self.shape[1] + p[1]) * self.shape[2] + p[2]]
     }
 
-    fn words(&self, _: usize, at: [u32; 3]) -> ([u64; SIDE], [u64; SIDE]) {
-        let (mut sign, mut valid) = ([0; SIDE], [0; SIDE]);
-        let base = at.map(|a| a as usize * SIDE);
-        let n = SIDE.min(self.shape[2] - base[2]);
-        for i in 0..SIDE.min(self.shape[0] - base[0]) {
-            for j in 0..SIDE.min(self.shape[1] - base[1]) {
-                let start = ((base[0] + i) * self.shape[1] + base[1] + j) * self.shape[2] + base[2];
-                let mut row = [f32::NAN; SIDE];
-                row[..n].copy_from_slice(&self.values[start..start + n]);
-                let (s, ok) = row_bits(&row);
-                sign[i] |= s << (j * SIDE);
-                valid[i] |= ok << (j * SIDE);
+    /// A task reads the 8 x 8 whole rows of a line of blocks: memory is read in order.
+    fn bits(&self, map: &BlockMap) -> Vec<Bits> {
+        let [nx, ny, nz] = self.shape;
+        let mut bits = zeroed::<Bits>(map.coords.len());
+        bits.par_chunks_exact_mut(map.dims[2]).enumerate().for_each(|(line, out)| {
+            let (i0, j0) = (line / map.dims[1] * SIDE, line % map.dims[1] * SIDE);
+            for i in i0..nx.min(i0 + SIDE) {
+                for j in j0..ny.min(j0 + SIDE) {
+                    row_bits(&self.values[(i * ny + j) * nz..][..nz], (i - i0) * SIDE + j - j0, out);
+                }
             }
-        }
-        (sign, valid)
+        });
+        bits
     }
 }
 
+/// Puts the signs and validity of row (i, j) = `row` into the line of blocks it runs through.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2", "x86_64+avx2", "aarch64+neon"))]
-fn row_bits(v: &[f32; SIDE]) -> (u64, u64) {
-    let (mut sign, mut valid) = (0u8, 0u8);
-    for k in 0..SIDE {
-        sign |= u8::from(v[k] < 0.0) << k;
-        valid |= u8::from(!v[k].is_nan()) << k;
+fn row_bits(values: &[f32], row: usize, blocks: &mut [Bits]) {
+    let (slice, shift) = (row / SIDE, row % SIDE * SIDE);
+    let (whole, rest) = values.as_chunks::<SIDE>();
+    for (v, block) in whole.iter().zip(&mut *blocks) {
+        let (mut sign, mut valid) = (0u8, 0u8);
+        for k in 0..SIDE {
+            sign |= u8::from(v[k] < 0.0) << k;
+            valid |= u8::from(!v[k].is_nan()) << k;
+        }
+        block.add(slice, shift, sign, valid);
     }
-    (u64::from(sign), u64::from(valid))
+    if !rest.is_empty() {
+        let bits = |test: fn(f32) -> bool| rest.iter().enumerate().map(|(k, &v)| u8::from(test(v)) << k).sum::<u8>();
+        blocks[whole.len()].add(slice, shift, bits(|v| v < 0.0), bits(|v| !v.is_nan()));
+    }
 }
 
-/// The bits of a block and the numbers of its vertices.
+/// The samples of a block as bits, one word a slice.
 #[derive(Clone, Copy, Default)]
-struct Block {
+struct Bits {
     sign: [u64; SIDE],
     valid: [u64; SIDE],
+}
+
+impl Bits {
+    #[inline(always)]
+    fn add(&mut self, slice: usize, shift: usize, sign: u8, valid: u8) {
+        self.sign[slice] |= u64::from(sign) << shift;
+        self.valid[slice] |= u64::from(valid) << shift;
+    }
+
+    /// Bit 0: a negative sample; bit 1: another known one.
+    fn kinds(&self) -> u8 {
+        let negative = self.sign.iter().any(|&w| w != 0);
+        let other = self.sign.iter().zip(&self.valid).any(|(s, v)| s != v);
+        u8::from(negative) | u8::from(other) << 1
+    }
+}
+
+/// The crossed edges of a block near the surface, and the numbers of its vertices and faces.
+#[derive(Clone, Copy, Default)]
+struct Crossings {
+    slot: u32,
     /// Crossed edges along x, y, z that start in this block, one word a slice.
     crossed: [[u64; SIDE]; 3],
     /// Vertices of this block before each axis and slice.
     rank: [[u16; SIDE]; 3],
-    /// Number of the block's first vertex, and of its first face.
+    /// Number of the block's first vertex, and of its first face; while counting, how many there are.
     vertex: u32,
     face: u32,
 }
@@ -151,7 +180,7 @@ fn shift_j(word: u64, over: u64) -> u64 {
 struct Corners([u64; 8]);
 
 impl Corners {
-    fn new(around: &[Option<&Block>; 8], i: usize, pick: impl Fn(&Block) -> &[u64; SIDE]) -> Self {
+    fn new(around: &[Option<&Bits>; 8], i: usize, pick: impl Fn(&Bits) -> &[u64; SIDE]) -> Self {
         let word = |block: usize, slice: usize| {
             let (block, slice) = if slice == SIDE { (block | 4, 0) } else { (block, slice) };
             around[block].map_or(0, |b| pick(b)[slice])
@@ -177,47 +206,68 @@ impl Corners {
     }
 }
 
+/// The volume's blocks as bits, and those near the surface with their crossings.
+struct Field<'a> {
+    map: &'a BlockMap,
+    bits: Vec<Bits>,
+    active: Vec<Crossings>,
+    /// Place in `active` of each slot, or [`NONE`].
+    number: Vec<u32>,
+}
+
+impl Field<'_> {
+    /// Slots of the 2x2x2 blocks from `at` on: index 4·di + 2·dj + dk.
+    fn around(&self, at: [u32; 3]) -> [u32; 8] {
+        std::array::from_fn(|n| {
+            self.map.at(at[0] as usize + (n >> 2), at[1] as usize + (n >> 1 & 1), at[2] as usize + (n & 1))
+        })
+    }
+
+    fn bits(&self, slots: [u32; 8]) -> [Option<&Bits>; 8] {
+        slots.map(|s| self.bits.get(s as usize))
+    }
+
+    fn crossings(&self, slots: [u32; 8]) -> [Option<&Crossings>; 8] {
+        slots.map(|s| self.number.get(s as usize).and_then(|&n| self.active.get(n as usize)))
+    }
+}
+
 fn extract<S: Samples>(map: &BlockMap, samples: &S) -> Surface {
-    let mut blocks: Vec<Block> = map
+    let bits = samples.bits(map);
+    let kinds: Vec<u8> = bits.par_iter().map(Bits::kinds).collect();
+    let partial = bits.par_iter().any(|b| b.valid != [!0; SIDE]);
+    let mut field = Field { map, bits, active: Vec::new(), number: zeroed(map.coords.len()) };
+    let found: Vec<Vec<Crossings>> = map
         .coords
-        .par_iter()
+        .par_chunks(TASK)
         .enumerate()
-        .map(|(slot, &at)| {
-            let (sign, valid) = samples.words(slot, at);
-            Block { sign, valid, ..Block::default() }
+        .map(|(task, coords)| {
+            let near = |(n, &at): (usize, &[u32; 3])| {
+                let slots = field.around(at);
+                let mixed = slots.iter().filter_map(|&s| kinds.get(s as usize)).fold(0, |a, b| a | b) == 3;
+                mixed.then(|| count((task * TASK + n) as u32, &field.bits(slots)))
+            };
+            coords.iter().enumerate().filter_map(near).collect()
         })
         .collect();
-    let counted: Vec<(Block, u32, u32)> = map.coords.par_iter().map(|&at| count(&around(map, &blocks, at))).collect();
-    let (mut vertices, mut faces, mut partial) = (0u32, 0u32, false);
-    for (block, (mut found, v, f)) in blocks.iter_mut().zip(counted) {
-        (found.vertex, found.face) = (vertices, faces);
-        partial |= found.valid.iter().any(|&w| w != !0);
+    field.active = found.concat();
+    field.number.fill(NONE);
+    let (mut vertices, mut faces) = (0u32, 0u32);
+    for (n, block) in field.active.iter_mut().enumerate() {
+        field.number[block.slot as usize] = n as u32;
+        let (v, f) = (block.vertex, block.face);
+        (block.vertex, block.face) = (vertices, faces);
         vertices += v;
         faces += f;
-        *block = found;
     }
-    let mut out = Surface { vertices: vec![[0.0; 3]; vertices as usize], faces: vec![[0; 3]; faces as usize] };
-    emit(map, &blocks, samples, &mut out);
+    let mut out = Surface { vertices: zeroed(vertices as usize), faces: zeroed(faces as usize) };
+    emit(&field, samples, &mut out);
     if partial { without_orphans(out) } else { out }
 }
 
-/// The 2x2x2 blocks from `at` on: index 4·di + 2·dj + dk.
-fn around<'a>(map: &BlockMap, blocks: &'a [Block], at: [u32; 3]) -> [Option<&'a Block>; 8] {
-    std::array::from_fn(|n| {
-        let slot = map.at(at[0] as usize + (n >> 2), at[1] as usize + (n >> 1 & 1), at[2] as usize + (n & 1));
-        (slot != NONE).then(|| &blocks[slot as usize])
-    })
-}
-
-/// Fills in a block's crossed edges and ranks; returns it with its numbers of vertices and faces.
-fn count(around: &[Option<&Block>; 8]) -> (Block, u32, u32) {
-    let mut block = around[0].copied().unwrap_or_default();
-    let mut faces = 0;
-    let quiet = around.iter().flatten().all(|b| b.sign.iter().all(|&w| w == 0))
-        || around.iter().flatten().all(|b| (0..SIDE).all(|i| b.sign[i] == b.valid[i]));
-    if quiet {
-        return (block, 0, 0);
-    }
+/// The crossed edges and ranks of the block in `slot`, with its numbers of vertices and faces.
+fn count(slot: u32, around: &[Option<&Bits>; 8]) -> Crossings {
+    let mut block = Crossings { slot, ..Crossings::default() };
     for i in 0..SIDE {
         let (sign, valid) = (Corners::new(around, i, |b| &b.sign), Corners::new(around, i, |b| &b.valid));
         for (axis, corner) in [(0, 4), (1, 2), (2, 1)] {
@@ -225,7 +275,7 @@ fn count(around: &[Option<&Block>; 8]) -> (Block, u32, u32) {
         }
         let mut cells = cut_cells(&sign, &valid);
         while cells != 0 {
-            faces += TRIANGLES[case_of(&sign, cells.trailing_zeros())].len() as u32;
+            block.face += TRIANGLES[case_of(&sign, cells.trailing_zeros())].len() as u32;
             cells &= cells - 1;
         }
     }
@@ -236,7 +286,8 @@ fn count(around: &[Option<&Block>; 8]) -> (Block, u32, u32) {
             rank += block.crossed[axis][i].count_ones() as u16;
         }
     }
-    (block, u32::from(rank), faces)
+    block.vertex = u32::from(rank);
+    block
 }
 
 fn cut_cells(sign: &Corners, valid: &Corners) -> u64 {
@@ -247,42 +298,38 @@ fn case_of(sign: &Corners, bit: u32) -> usize {
     (0..8).map(|c| ((sign.0[c] >> bit & 1) as usize) << c).sum()
 }
 
-fn emit<S: Samples>(map: &BlockMap, blocks: &[Block], samples: &S, out: &mut Surface) {
+fn emit<S: Samples>(field: &Field, samples: &S, out: &mut Surface) {
     let (mut vertices, mut faces) = (&mut out.vertices[..], &mut out.faces[..]);
     let (all_vertices, all_faces) = (vertices.len(), faces.len());
     let mut tasks = Vec::new();
-    for first in (0..blocks.len()).step_by(TASK) {
-        let end = (first + TASK).min(blocks.len());
-        let last = |of: fn(&Block) -> u32, all| if end < blocks.len() { of(&blocks[end]) as usize } else { all };
-        let (nv, nf) = (
-            last(|b| b.vertex, all_vertices) - blocks[first].vertex as usize,
-            last(|b| b.face, all_faces) - blocks[first].face as usize,
-        );
+    for blocks in field.active.chunks(TASK) {
+        let first = &blocks[0];
+        let next = field.number[first.slot as usize] as usize + blocks.len();
+        let (end_v, end_f) =
+            field.active.get(next).map_or((all_vertices, all_faces), |b| (b.vertex as usize, b.face as usize));
         let (v, f);
-        (v, vertices) = vertices.split_at_mut(nv);
-        (f, faces) = faces.split_at_mut(nf);
-        if nv + nf > 0 {
-            tasks.push((first..end, v, f));
-        }
+        (v, vertices) = vertices.split_at_mut(end_v - first.vertex as usize);
+        (f, faces) = faces.split_at_mut(end_f - first.face as usize);
+        tasks.push((blocks, v, f));
     }
-    tasks.into_par_iter().for_each(|(range, v, f)| {
+    tasks.into_par_iter().for_each(|(blocks, v, f)| {
         let (mut v, mut f) = (v.iter_mut(), f.iter_mut());
-        for slot in range {
-            let at = map.coords[slot];
-            emit_vertices(map, &blocks[slot], samples, slot, at, &mut v);
-            emit_faces(&around(map, blocks, at), &mut f);
+        for block in blocks {
+            let slots = field.around(field.map.coords[block.slot as usize]);
+            emit_vertices(field.map, block, samples, &mut v);
+            emit_faces(&field.bits(slots), &field.crossings(slots), &mut f);
         }
     });
 }
 
 fn emit_vertices<'a, S: Samples>(
     map: &BlockMap,
-    block: &Block,
+    block: &Crossings,
     samples: &S,
-    slot: usize,
-    at: [u32; 3],
     out: &mut impl Iterator<Item = &'a mut [f32; 3]>,
 ) {
+    let slot = block.slot as usize;
+    let at = map.coords[slot];
     for axis in 0..3 {
         for i in 0..SIDE {
             let mut word = block.crossed[axis][i];
@@ -313,9 +360,13 @@ fn emit_vertices<'a, S: Samples>(
     }
 }
 
-fn emit_faces<'a>(around: &[Option<&Block>; 8], out: &mut impl Iterator<Item = &'a mut [u32; 3]>) {
+fn emit_faces<'a>(
+    bits: &[Option<&Bits>; 8],
+    around: &[Option<&Crossings>; 8],
+    out: &mut impl Iterator<Item = &'a mut [u32; 3]>,
+) {
     for i in 0..SIDE {
-        let (sign, valid) = (Corners::new(around, i, |b| &b.sign), Corners::new(around, i, |b| &b.valid));
+        let (sign, valid) = (Corners::new(bits, i, |b| &b.sign), Corners::new(bits, i, |b| &b.valid));
         let mut cells = cut_cells(&sign, &valid);
         while cells != 0 {
             let bit = cells.trailing_zeros();
@@ -332,7 +383,7 @@ fn emit_faces<'a>(around: &[Option<&Block>; 8], out: &mut impl Iterator<Item = &
 
 /// Number of the vertex on an edge of a cell, made by the block that owns the edge's lower corner.
 #[inline(always)]
-fn vertex_number(around: &[Option<&Block>; 8], cell: [usize; 3], edge: usize) -> u32 {
+fn vertex_number(around: &[Option<&Crossings>; 8], cell: [usize; 3], edge: usize) -> u32 {
     let corner = EDGES[edge].0;
     let mut owner = 0;
     let mut p = cell;

@@ -14,12 +14,14 @@ pub mod fuse;
 pub mod grid;
 pub mod isosurface;
 pub mod match_epipolar;
+pub mod memory;
 pub mod mesh;
 pub mod nearest;
 pub mod patch;
 pub mod raster;
 pub mod rasterize;
 pub mod select_views;
+pub mod shade;
 pub mod slanted;
 pub mod sweep;
 
