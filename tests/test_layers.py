@@ -16,6 +16,7 @@ ORDER = [
     "config",
     "io",
     "sparse",
+    "network",
     "depth",
     "volume",
     "surface",
@@ -34,7 +35,7 @@ def imports(path: Path) -> set[str]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
             if inner and node.level == 1:
-                found.add("io")
+                found.add(path.parent.name)
             else:
                 found |= {node.module.split(".")[0]} if node.module else {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom | ast.Import):

@@ -233,6 +233,47 @@ def demo(
         reconstruct(sample, output / "pickup.glb", masks=sample / "masks", report=output / "report.json", save_depth=output / "depth")
 
 
+train = typer.Typer(no_args_is_help=True, help="Train the network, or look at what it is trained on.")
+app.add_typer(train, name="train")
+
+
+@train.command("data")
+def train_data(
+    preview: Annotated[Path, typer.Option(help="Contact sheet to write, a PNG.")],
+    seed: Annotated[int, typer.Option(help="Of the scenes.")] = 1,
+    held_out: Annotated[bool, typer.Option(help="Shapes and textures kept for validation.")] = False,
+    debug: Debug = False,
+) -> None:
+    """A contact sheet of procedural scenes: views, true inverse depth, what the first source sees."""
+    with _one_line_errors(debug):
+        from ._core import encode_png
+        from .io.write import atomically
+        from .network.scenes import contact_sheet
+
+        sheet, speed = contact_sheet(seed, held_out)
+        atomically(preview, lambda path: path.write_bytes(encode_png(sheet)) and None)
+        print(f"{preview}: {speed:.1f} samples a second")
+
+
+@train.command("disparity")
+def train_disparity_network(
+    out: Annotated[Path, typer.Option(help="Folder of checkpoints, log and weights; an earlier run there goes on.")],
+    steps: Annotated[int, typer.Option(min=1, help="Batches in all.")] = 10_000,
+    preset: Annotated[str, typer.Option(help="compact or paper.")] = "compact",
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    hours: Annotated[float | None, typer.Option(help="Stop after this long, with a checkpoint.")] = None,
+    debug: Debug = False,
+) -> None:
+    """Train the disparity network on procedural scenes."""
+    with _one_line_errors(debug):
+        from .network.features import PRESETS
+        from .network.train_disparity import Training, train_disparity
+
+        if preset not in PRESETS:
+            raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
+        print(train_disparity(Training(steps=steps, preset=preset, hours=hours), out, device))
+
+
 def main() -> None:
     """Entry point; Ctrl-C ends quietly."""
     try:

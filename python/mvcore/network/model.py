@@ -1,0 +1,118 @@
+"""The disparity network: one set of weights for rectified pairs and for posed views (paper section 3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from .cost import correlate, scaled_maps, unit
+from .features import PRESETS, Features, normalised
+from .regularise import ConvexUpsample, Regulariser, soft_argmin, windowed_soft_argmin
+
+COARSE_GROUPS, FINE_GROUPS = 8, 8
+COARSE_CHANNELS, FINE_CHANNELS = (16, 32, 48), (16, 32, 32)
+FINE_PLANES = 8
+FINE_RATIO = 0.25
+"""Interval of the second stage's planes in intervals of the first's."""
+
+
+@dataclass
+class Prediction:
+    """What the network says of a view, in inverse depth.
+
+    inverse : (B, H, W) at full size; confidence : (B, H, W) probability of the four nearest planes, 0 .. 1.
+    """
+
+    inverse: Tensor
+    confidence: Tensor
+
+
+@dataclass
+class Training:
+    """What the losses need: planes' scores and expectations, in planes of their stage."""
+
+    coarse_scores: list[Tensor]
+    coarse: list[Tensor]
+    fine_start: Tensor
+    fine_scores: list[Tensor]
+    fine: Tensor
+    full: Tensor
+
+
+class DisparityNet(nn.Module):
+    """Features, cost space, hourglasses at quarter size; a narrow second search at half size; learned up-sampling to full.
+
+    Parameters
+    ----------
+    preset : ``compact`` or ``paper``, the widths of the trunk.
+    hourglasses : stacked; with one output module before them and one after each, three give the paper's four.
+    groups : correlation groups at quarter size.
+    """
+
+    def __init__(self, preset: str = "compact", hourglasses: int = 3, groups: int = COARSE_GROUPS, windowed: bool = True) -> None:
+        super().__init__()
+        widths = PRESETS[preset]
+        self.preset, self.groups, self.windowed = preset, groups, windowed
+        self.features = Features(widths)
+        context = widths.blocks[2]
+        self.coarse = Regulariser(groups, COARSE_CHANNELS, context, hourglasses)
+        detail = widths.blocks[1]
+        self.fine = Regulariser(FINE_GROUPS, FINE_CHANNELS, detail, 1)
+        self.up4, self.up2 = ConvexUpsample(context), ConvexUpsample(detail)
+        self.gain = nn.Parameter(torch.full((groups,), 4.0 / groups))
+        self.bias = nn.Parameter(torch.tensor(-2.0))
+        self.apply(_initialised)
+
+    def forward(
+        self, reference: Tensor, sources: list[Tensor], maps: list[Tensor], low: Tensor, high: Tensor, planes: int
+    ) -> Prediction | Training:
+        """Inverse depth of the reference view.
+
+        reference : (B, 3, H, W) of 0 .. 255, sides divisible by 16; sources : likewise, one each.
+        maps : (B, 12) relative maps reference to source for full-size pixels; low, high : (B,) inverse depths; planes : of the first stage.
+        """
+        images = [reference, *sources]
+        quarter, half, context, detail = zip(*(self._features(images)), strict=True)
+        step = (high - low) / (planes - 1)
+        number = torch.arange(planes, device=low.device, dtype=torch.float32)
+        b, _c, h, w = quarter[0].shape
+        swept = (low[:, None] + step[:, None] * number)[..., None, None].expand(b, planes, h, w)
+        f = [unit(q, self.groups) for q in quarter]
+        costs = correlate(f[0], f[1:], [scaled_maps(m, 4) for m in maps], swept, self.groups, self.gain, self.bias)
+        coarse_scores = self.coarse(costs, context[0])
+        coarse, confidence = self._expected(coarse_scores[-1])
+        begun = self.up4(torch.stack([coarse, confidence], 1), context[0])
+        start = begun.detach()
+        inverse = low[:, None, None] + step[:, None, None] * start[:, 0]
+        offset = (torch.arange(FINE_PLANES, device=low.device) - (FINE_PLANES - 1) / 2) * FINE_RATIO
+        narrow = inverse[:, None] + (offset * step[:, None])[..., None, None]
+        g = [unit(x, FINE_GROUPS) for x in half]
+        one = torch.ones(FINE_GROUPS, device=low.device) * (4.0 / FINE_GROUPS)
+        costs = correlate(g[0], g[1:], [scaled_maps(m, 2) for m in maps], narrow, FINE_GROUPS, one, self.bias)
+        fine_scores = self.fine(costs, detail[0])
+        fine = soft_argmin(fine_scores[-1])
+        moved = start[:, 0] + (fine - (FINE_PLANES - 1) / 2) * FINE_RATIO
+        full = self.up2(torch.stack([moved, start[:, 1]], 1), detail[0])
+        if self.training:
+            expectations = [soft_argmin(s) for s in coarse_scores]
+            return Training(coarse_scores, expectations, begun[:, 0], fine_scores, fine, full[:, 0])
+        return Prediction(low[:, None, None] + step[:, None, None] * full[:, 0], full[:, 1])
+
+    def _expected(self, scores: Tensor) -> tuple[Tensor, Tensor]:
+        plane, confidence = windowed_soft_argmin(scores)
+        return (plane if self.windowed else soft_argmin(scores)), confidence
+
+    def _features(self, images: list[Tensor]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        if all(i.shape == images[0].shape for i in images):
+            together = self.features(normalised(torch.cat(images)))
+            return list(zip(*(t.chunk(len(images)) for t in together), strict=True))
+        return [self.features(normalised(i)) for i in images]
+
+
+def _initialised(module: nn.Module) -> None:
+    if isinstance(module, nn.Conv2d | nn.Conv3d):
+        nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)

@@ -1,0 +1,199 @@
+"""Training of the disparity network: resumable, logged, validated; the best checkpoint is kept."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import csv
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from .batches import Batch, Recipe, make_batch
+from .losses import loss
+from .model import DisparityNet, Prediction
+from .weights import save_weights
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training run.
+
+    steps : batches in all. rate : AdamW's, after ``warmup`` steps, falling linearly to zero over the last ``decay`` share.
+    every : steps between validations and checkpoints. hours : stop after this long, with a checkpoint.
+    """
+
+    steps: int = 10_000
+    preset: str = "compact"
+    hourglasses: int = 3
+    groups: int = 8
+    rate: float = 1e-3
+    warmup: int = 200
+    decay: float = 0.4
+    every: int = 250
+    averaging: float = 0.998
+    hours: float | None = None
+    workers: int = 1
+    recipe: Recipe = field(default_factory=Recipe)
+
+
+class _Batches(Dataset[Batch]):
+    def __init__(self, recipe: Recipe, steps: int) -> None:
+        self.recipe, self.steps = recipe, steps
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __getitem__(self, number: int) -> Batch:
+        return make_batch(self.recipe, number)
+
+
+def _stream(recipe: Recipe, first: int, steps: int, workers: int) -> Iterator[Batch]:
+    numbers = range(first, steps)
+    if workers == 0:
+        return (make_batch(recipe, n) for n in numbers)
+    spawned = {"multiprocessing_context": "spawn", "prefetch_factor": 4}
+    loader: DataLoader[Batch] = DataLoader(_Batches(recipe, steps), batch_size=None, sampler=list(numbers), num_workers=workers, **spawned)  # type: ignore[arg-type]
+    return iter(loader)
+
+
+def precision(device: torch.device) -> contextlib.AbstractContextManager[Any]:
+    """bfloat16 on CUDA. On a CPU float32: torch's bfloat16 convolutions there were seen to give other gradients each time, some NaN."""
+    return torch.autocast("cuda", torch.bfloat16) if device.type == "cuda" else contextlib.nullcontext()
+
+
+def _to(batch: Batch, device: torch.device) -> Batch:
+    def moved(value: Any) -> Any:
+        return value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+
+    lists = {k: [moved(v) for v in getattr(batch, k)] for k in ("images", "maps")}
+    return replace(batch, **lists, **{k: moved(getattr(batch, k)) for k in ("inverse", "seen", "low", "high")})
+
+
+class _Average:
+    """Exponential average of the weights: what a falling rate would settle to."""
+
+    def __init__(self, net: nn.Module, keep: float) -> None:
+        self.net, self.keep = copy.deepcopy(net).eval(), keep
+
+    @torch.no_grad()
+    def update(self, net: nn.Module, step: int) -> None:
+        keep = min(self.keep, (1 + step) / (10 + step))
+        for mine, theirs in zip(self.net.state_dict().values(), net.state_dict().values(), strict=True):
+            if mine.dtype.is_floating_point:
+                mine.lerp_(theirs, 1 - keep)
+            else:
+                mine.copy_(theirs)
+
+
+def _rate(training: Training, step: int) -> float:
+    left = (training.steps - step) / max(1.0, training.decay * training.steps)
+    return training.rate * min(1.0, (step + 1) / training.warmup, left)
+
+
+def train_disparity(training: Training, out: Path, device: str = "cpu", report: Any = print, stop_after: int | None = None) -> Path:
+    """Trains, or goes on where a run into the same folder stopped; returns the path of the best weights.
+
+    ``out`` receives ``last.pt`` (to resume), ``log.csv`` and ``best.safetensors`` by the held-out families' bad-1 share.
+    ``stop_after`` ends this call once so many steps are done; the schedule stays that of the whole training.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    where = torch.device(device)
+    torch.manual_seed(training.recipe.seed)
+    net = DisparityNet(training.preset, training.hourglasses, training.groups).to(where).train()
+    average = _Average(net, training.averaging)
+    optimiser = torch.optim.AdamW(net.parameters(), training.rate, weight_decay=1e-4)
+    step, best, last = 0, float("inf"), out / "last.pt"
+    if last.exists():
+        state = torch.load(last, map_location=where, weights_only=True)
+        net.load_state_dict(state["net"])
+        average.net.load_state_dict(state["average"])
+        optimiser.load_state_dict(state["optimiser"])
+        step, best = state["step"], state["best"]
+        _cut_log(out / "log.csv", step)
+    started, seen, total = time.perf_counter(), 0, 0.0
+    for batch in _stream(training.recipe, step, training.steps, training.workers):
+        for group in optimiser.param_groups:
+            group["lr"] = _rate(training, step)
+        total += _step(net, optimiser, _to(batch, where), where)
+        step, seen = step + 1, seen + 1
+        average.update(net, step)
+        timed_out = training.hours is not None and time.perf_counter() - started > training.hours * 3600
+        if step % training.every == 0 or step == training.steps or timed_out:
+            figures = validate(average.net, training.recipe, where)
+            row = {"step": step, "loss": total / seen, "seconds": time.perf_counter() - started, **figures}
+            _log(out / "log.csv", row)
+            report(" ".join(f"{k} {v:.4g}" for k, v in row.items()))
+            total, seen = 0.0, 0
+            if figures["pair_bad1"] + figures["views_bad1"] < best:
+                best = figures["pair_bad1"] + figures["views_bad1"]
+                save_weights(average.net, out / "best.safetensors", {"step": str(step)})
+            state = {"net": net.state_dict(), "average": average.net.state_dict(), "optimiser": optimiser.state_dict()}
+            torch.save({**state, "step": step, "best": best}, out / "last.tmp")
+            os.replace(out / "last.tmp", last)
+        if timed_out or step == stop_after:
+            break
+    return out / "best.safetensors"
+
+
+def _step(net: DisparityNet, optimiser: torch.optim.Optimizer, batch: Batch, device: torch.device) -> float:
+    optimiser.zero_grad(set_to_none=True)
+    with precision(device):
+        output = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+        value = loss(output, batch.inverse, batch.low, batch.high)
+    value.backward()
+    norm = nn.utils.clip_grad_norm_(net.parameters(), 2.0)
+    if torch.isfinite(norm):
+        optimiser.step()
+    return float(value.detach())
+
+
+@torch.no_grad()
+def validate(net: DisparityNet, recipe: Recipe, device: torch.device, batches: int = 12) -> dict[str, float]:
+    """On held-out shapes and textures: mean error and shares of pixels worse than one plane (of 32), pairs and posed views apart."""
+    figures: dict[str, float] = {}
+    for name, pairs in (("pair", 1.0), ("views", 0.0)):
+        held_out = replace(recipe, seed=recipe.seed + 1_000_000, held_out=True, pairs=pairs)
+        errors, pixels = [], []
+        for n in range(batches):
+            batch = _to(replace(make_batch(held_out, n), planes=32), device)
+            with precision(device):
+                found: Prediction = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+            known = (batch.inverse > 0) & (batch.inverse >= batch.low[:, None, None]) & (batch.inverse <= batch.high[:, None, None])
+            if name == "views":
+                known &= batch.seen.any(1)
+            error = (found.inverse - batch.inverse).abs()
+            errors.append((error / ((batch.high - batch.low) / 31)[:, None, None])[known])
+            pixels.append(error[known])
+        planes = torch.cat(errors)
+        figures[f"{name}_bad1"] = float((planes > 1).float().mean())
+        figures[f"{name}_bad025"] = float((planes > 0.25).float().mean())
+        if name == "pair":
+            figures["pair_epe"] = float(torch.cat(pixels).mean())
+    return figures
+
+
+def _cut_log(path: Path, step: int) -> None:
+    """Drops lines after ``step``, which a kill may have left."""
+    if path.exists():
+        with path.open(newline="") as file:
+            rows = [r for r in csv.DictReader(file) if int(float(r["step"])) <= step]
+        path.unlink()
+        for row in rows:
+            _log(path, row)
+
+
+def _log(path: Path, row: dict[str, Any]) -> None:
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)

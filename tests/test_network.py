@@ -1,0 +1,136 @@
+"""The network's parts: geometry of the cost space, gradients, the procedural truth, training, weights."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from mvcore.cameras import relative_map  # noqa: E402
+from mvcore.errors import FormatError  # noqa: E402
+from mvcore.network.batches import Recipe, make_batch  # noqa: E402
+from mvcore.network.cost import correlate, landing, scaled_maps, unit  # noqa: E402
+from mvcore.network.features import PRESETS, Trunk, load_vgg16  # noqa: E402
+from mvcore.network.losses import loss  # noqa: E402
+from mvcore.network.model import DisparityNet  # noqa: E402
+from mvcore.network.regularise import soft_argmin, windowed_soft_argmin  # noqa: E402
+from mvcore.network.scenes import Tiles, random_pair, random_views  # noqa: E402
+from mvcore.network.train_disparity import Training, train_disparity  # noqa: E402
+from mvcore.network.weights import load_disparity, save_weights  # noqa: E402
+
+SMALL = Recipe(width=64, height=48)
+
+
+@pytest.fixture(scope="module")
+def tiles():
+    return Tiles(np.random.default_rng(0), False, 12)
+
+
+def test_planes_land_where_the_cameras_project(tiles):
+    sample = random_views(np.random.default_rng(1), tiles, 2, 64, 48)
+    reference, source = sample.cameras
+    maps = torch.from_numpy(relative_map(reference, source))[None]
+    x, y = landing(maps, torch.from_numpy(sample.inverse)[None, None])
+    world = reference.unproject(reference.pixel_grid().reshape(-1, 2), 1 / sample.inverse.reshape(-1))
+    expected = source.project(world).reshape(48, 64, 2)
+    assert np.allclose(np.stack([x[0, 0], y[0, 0]], -1), expected, atol=0.05)
+    # A quarter-size pixel u covers the full-size pixels 4u .. 4u + 3: its middle is 4u + 1.5.
+    quarter = scaled_maps(maps, 4)
+    qx, _ = landing(quarter, torch.full((1, 1, 12, 16), float(sample.inverse[21, 29])))
+    full, _ = landing(maps, torch.full((1, 1, 48, 64), float(sample.inverse[21, 29])))
+    between = full[0, 0, 21:23, 29:31].mean()
+    assert abs(4 * qx[0, 0, 5, 7] + 1.5 - between) < 0.05
+
+
+def test_the_true_plane_correlates_best(tiles):
+    """Correlating the images themselves, the true disparity beats its neighbours where both views see the surface."""
+    sample = random_pair(np.random.default_rng(3), tiles, 128, 96, max_disparity=30.0)
+    images = [torch.from_numpy(i).permute(2, 0, 1)[None].float() for i in sample.images]
+    patches = [torch.nn.functional.unfold(i, 7, padding=3).view(1, -1, 96, 128) for i in images]
+    features = [unit(p - p.mean(1, keepdim=True), 1) for p in patches]
+    planes = torch.arange(0, 36.0).view(1, -1, 1, 1).expand(1, 36, 96, 128)
+    maps = torch.from_numpy(relative_map(*sample.cameras))[None]
+    corr = correlate(features[0], features[1:], [maps], planes, 1, torch.ones(1), torch.zeros(()))
+    found = corr[0, 0].argmax(0).numpy()
+    right = np.abs(found - sample.inverse) < 1.5
+    assert right[sample.seen[0]].mean() > 0.5
+
+
+def test_gradients_of_the_cost_space_equal_finite_differences():
+    torch.manual_seed(0)
+    maps = torch.tensor([[1, 0.02, 0.1, -0.01, 1, 0.2, 0, 0, 1, -1.0, 0.1, 0.01]], dtype=torch.float64)
+    planes = torch.tensor([0.3, 1.1, 1.7], dtype=torch.float64).view(1, 3, 1, 1).expand(1, 3, 4, 5)
+    a, b = (torch.rand(1, 4, 4, 5, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    gain = torch.rand(2, dtype=torch.float64, requires_grad=True)
+    bias = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    torch.autograd.gradcheck(lambda f, g, k, c: correlate(f, [g, 1 - g], [maps, maps], planes, 2, k, c), (a, b, gain, bias))
+
+
+def test_the_window_stays_on_one_side_of_an_edge():
+    scores = torch.full((1, 20, 1, 1), -9.0)
+    scores[0, 3], scores[0, 15] = 2.0, 1.9
+    plane, confidence = windowed_soft_argmin(scores)
+    assert abs(plane.item() - 3) < 0.01
+    assert 4 < soft_argmin(scores).item() < 14
+    assert 0.4 < confidence.item() < 0.6
+
+
+def test_batches_are_functions_of_seed_and_number():
+    first, again, other = make_batch(SMALL, 5), make_batch(SMALL, 5), make_batch(replace(SMALL, seed=2), 5)
+    assert torch.equal(first.images[0], again.images[0])
+    assert torch.equal(first.inverse, again.inverse)
+    assert not torch.equal(first.images[0], other.images[0])
+    assert (first.inverse > 0).float().mean() > 0.9
+
+
+def test_twenty_steps_lower_the_loss():
+    torch.manual_seed(0)
+    net = DisparityNet().train()
+    optimiser = torch.optim.AdamW(net.parameters(), 1e-3)
+    batch = make_batch(SMALL, 0)
+    values = []
+    for _ in range(20):
+        optimiser.zero_grad()
+        out = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, 24)
+        value = loss(out, batch.inverse, batch.low, batch.high)
+        value.backward()
+        optimiser.step()
+        values.append(float(value.detach()))
+    assert np.mean(values[-3:]) < 0.7 * np.mean(values[:3])
+
+
+def test_a_killed_training_goes_on_to_the_same_weights(tmp_path):
+    training = Training(steps=4, every=2, workers=0, recipe=SMALL)
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    train_disparity(training, straight, report=lambda _: None)
+    train_disparity(training, broken, report=lambda _: None, stop_after=2)
+    train_disparity(training, broken, report=lambda _: None)
+    states = [torch.load(p / "last.pt", weights_only=True)["net"] for p in (straight, broken)]
+    assert all(torch.equal(states[0][k], states[1][k]) for k in states[0])
+    with (broken / "log.csv").open() as file:
+        assert [int(r["step"]) for r in csv.DictReader(file)] == [2, 4]
+
+
+def test_weights_come_back_and_others_are_refused(tmp_path):
+    net = DisparityNet(hourglasses=1)
+    save_weights(net, tmp_path / "w.safetensors")
+    loaded = load_disparity(tmp_path / "w.safetensors")
+    assert torch.allclose(loaded.gain, net.gain, atol=1e-3)
+    assert sum(p.numel() for p in DisparityNet().parameters()) < 3_500_000
+    (tmp_path / "no.safetensors").write_bytes(b"not weights")
+    with pytest.raises(FormatError, match=r"no\.safetensors"):
+        load_disparity(tmp_path / "no.safetensors")
+
+
+def test_vgg16_weights_are_taken_by_their_names():
+    trunk = Trunk(PRESETS["paper"])
+    shapes = [(0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256)]
+    state = {f"features.{n}.weight": torch.full((o, i, 3, 3), float(n)) for n, i, o in shapes}
+    state |= {f"features.{n}.bias": torch.zeros(o) for n, _, o in shapes}
+    load_vgg16(trunk, state)
+    assert float(trunk.blocks[2][4].weight[0, 0, 0, 0]) == 14
+    del state["features.7.bias"]
+    with pytest.raises(ValueError, match=r"features\.7\.bias"):
+        load_vgg16(trunk, state)
