@@ -17,6 +17,7 @@ use mvcore::nearest::nearest_distance;
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::rasterize::rasterize;
 use mvcore::select_views::{Photo, SelectParams, rate, select_views};
+use mvcore::shade::{Shot, Surface};
 use mvcore::slanted::{Hypothesis, RefineParams, refine};
 use mvcore::sweep::sweep;
 use std::hint::black_box;
@@ -144,6 +145,8 @@ fn volumes(c: &mut Criterion) {
     group.sample_size(10);
     group.throughput(Throughput::Elements((24 * w * h) as u64));
     group.bench_function("fuse 24 maps 640x480 into 256^3", |b| b.iter(|| fuse(grid, &views, &FUSION).unwrap()));
+    let smooth = FusionParams { smoothing: 0.7, ..FUSION };
+    group.bench_function("the same, smoothed", |b| b.iter(|| fuse(grid, &views, &smooth).unwrap()));
     let volume = fuse(grid, &views, &FUSION).unwrap();
     group.throughput(Throughput::Elements(volume.values.len() as u64));
     group.bench_function("isosurface of that, sparse", |b| {
@@ -195,6 +198,22 @@ fn meshes(c: &mut Criterion) {
     group.throughput(Throughput::Elements(surface.faces.len() as u64));
     let (p, center) = ring(8, 0, w, h, focal);
     group.bench_function("rasterize", |b| b.iter(|| rasterize(mesh, &p, w, h).unwrap()));
+    let uv: Vec<[f32; 2]> = vertices.iter().map(|v| [v[0] as f32, v[1] as f32]).collect();
+    let normals: Vec<[f32; 3]> = vertices.iter().map(|v| v.map(|x| (x / 0.96) as f32)).collect();
+    let materials = vec![0; surface.faces.len()];
+    let tile: Vec<u8> = (0..256 * 256 * 3).map(|i| shade((i / 3 % 256) as f32, (i / 768) as f32)).collect();
+    let covering = Surface {
+        uv: &uv,
+        normals: &normals,
+        materials: &materials,
+        textures: &tile,
+        size: 256,
+        gloss: &[[0.4, 0.6, 0.3, 20.0]],
+    };
+    let shot = Shot { projection: p, lamp: [0.0, 0.0, 4.0], width: 256, height: 192, samples: 2 };
+    group.bench_function("shade 256x192, 4 samples a pixel", |b| {
+        b.iter(|| mvcore::shade::shade(mesh, covering, &shot).unwrap());
+    });
     let (depth, _) = rasterize(mesh, &p, w, h).unwrap();
     let photo = Photo {
         rgb: image,
