@@ -60,10 +60,16 @@ def test_a_layer_imports_only_what_stands_to_its_left(layer):
 def test_kernels_do_not_import_each_other():
     source = PACKAGE.parents[1] / "rust" / "mvcore" / "src"
     nouns = {"error", "memory", "raster", "grid", "mesh"}
-    below = {"slanted": {"patch"}, "isosurface": {"cube"}, "shade": {"rasterize"}}
+    below = {"slanted": {"patch"}, "isosurface": {"cube"}, "shade": {"rasterize"}, "fuse": {"smooth"}}
     for file in source.glob("*.rs"):
         used = set(re.findall(r"^use crate::(\w+)", file.read_text(), re.MULTILINE))
         assert used <= nouns | below.get(file.stem, set()), file.name
+
+
+def test_only_the_network_imports_torch():
+    for file in PACKAGE.rglob("*.py"):
+        names = {a.name for n in ast.walk(ast.parse(file.read_text())) if isinstance(n, ast.Import) for a in n.names}
+        assert "torch" not in names or file.parent.name == "network", file
 
 
 def test_import_is_light():

@@ -251,7 +251,12 @@ def train_data(
         from .network.scenes import contact_sheet
 
         sheet, speed = contact_sheet(seed, held_out)
-        atomically(preview, lambda path: path.write_bytes(encode_png(sheet)) and None)
+        encoded = encode_png(sheet)
+
+        def write(path: Path) -> None:
+            path.write_bytes(encoded)
+
+        atomically(preview, write)
         print(f"{preview}: {speed:.1f} samples a second")
 
 

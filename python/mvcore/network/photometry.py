@@ -21,7 +21,7 @@ def through_a_camera(image: Image, random: Random) -> Image:
     if random.random() < 0.4:
         value = cv2.GaussianBlur(value, (0, 0), random.uniform(0.3, 1.0))
     value = np.clip(value, 0, 1) ** np.float32(np.exp(random.normal(0, 0.15)))
-    value += random.normal(0, 1, value.shape).astype(np.float32) * np.float32(random.uniform(0, 0.03) ** 1.0)
+    value += random.normal(0, 1, value.shape).astype(np.float32) * np.float32(random.uniform(0, 0.03))
     out = np.clip(value * 255 + 0.5, 0, 255).astype(np.uint8)
     if random.random() < 0.4:
         done, code = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(random.integers(50, 96))])

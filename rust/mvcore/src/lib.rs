@@ -1,8 +1,8 @@
 //! Multi-view stereo kernels in plain Rust: arrays in, arrays out, no Python, no I/O beyond mesh and atlas files.
 //!
-//! Order of the modules: [`error`] ← nouns ([`raster`]) ← one file a kernel. Kernels never call each other, but for the sample
-//! loop [`patch`] that [`slanted`] runs on. Threads come from rayon's global pool; every kernel gives the same bytes for
-//! any number of them.
+//! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`]) ← one file a kernel. Four kernels stand on a part
+//! of their own: [`slanted`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`]; no other calls
+//! another. Threads come from rayon's global pool; every kernel gives the same bytes for any number of them.
 
 pub mod aggregate;
 pub mod atlas;
@@ -23,6 +23,7 @@ pub mod rasterize;
 pub mod select_views;
 pub mod shade;
 pub mod slanted;
+pub mod smooth;
 pub mod sweep;
 
 pub use error::{Error, Result};
