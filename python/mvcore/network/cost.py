@@ -43,8 +43,8 @@ def correlate_one(reference: Tensor, source: Tensor, maps: Tensor, planes: Tenso
 
 def unit(features: Tensor, groups: int) -> Tensor:
     """Each group of channels scaled to unit length."""
-    grouped = features.float().unflatten(1, (groups, -1))
-    return F.normalize(grouped, dim=2, eps=1e-4).flatten(1, 2)
+    grouped = features.float().contiguous().unflatten(1, (groups, -1))
+    return (grouped * torch.rsqrt(grouped.square().sum(2, keepdim=True) + 1e-6)).flatten(1, 2)
 
 
 def correlate(

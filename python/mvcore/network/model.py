@@ -12,7 +12,7 @@ from .features import PRESETS, Features, normalised
 from .regularise import ConvexUpsample, Regulariser, soft_argmin, windowed_soft_argmin
 
 COARSE_GROUPS, FINE_GROUPS = 8, 8
-COARSE_CHANNELS, FINE_CHANNELS = (16, 32, 48), (16, 32, 32)
+COARSE_CHANNELS, FINE_CHANNELS = (16, 32, 48), (8, 16, 32)
 FINE_PLANES = 8
 FINE_RATIO = 0.25
 """Interval of the second stage's planes in intervals of the first's."""
@@ -64,6 +64,7 @@ class DisparityNet(nn.Module):
         self.gain = nn.Parameter(torch.full((groups,), 4.0 / groups))
         self.bias = nn.Parameter(torch.tensor(-2.0))
         self.apply(_initialised)
+        self.apply(_channels_last)
 
     def forward(
         self, reference: Tensor, sources: list[Tensor], maps: list[Tensor], low: Tensor, high: Tensor, planes: int
@@ -116,3 +117,11 @@ def _initialised(module: nn.Module) -> None:
         nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
         if module.bias is not None:
             nn.init.zeros_(module.bias)
+
+
+def _channels_last(module: nn.Module) -> None:
+    """Weights in the layout that torch's convolutions are fastest in on a CPU: up to twice, with 8 channels."""
+    if isinstance(module, nn.Conv2d):
+        module.to(memory_format=torch.channels_last)
+    elif isinstance(module, nn.Conv3d):
+        module.to(memory_format=torch.channels_last_3d)

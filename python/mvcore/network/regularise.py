@@ -49,7 +49,7 @@ class Output(nn.Sequential):
     """An output module: two 3D convolutions down to one channel of costs' negatives."""
 
     def __init__(self, channels: int) -> None:
-        super().__init__(*_conv(channels, channels), nn.Conv3d(channels, 1, 3, padding=1, bias=False))
+        super().__init__(*_conv(channels, 8), nn.Conv3d(8, 1, 3, padding=1, bias=False))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, D, H, W) to (B, D, H, W)."""
@@ -71,7 +71,7 @@ class Regulariser(nn.Module):
 
     def forward(self, costs: Tensor, context: Tensor) -> list[Tensor]:
         """Scores of each output module; at inference of the last."""
-        x = self.guide(self.enter(costs), context)
+        x = self.guide(self.enter(costs.contiguous(memory_format=torch.channels_last_3d)), context)
         if not self.training:
             for hourglass in self.hourglasses:
                 x = hourglass(x)

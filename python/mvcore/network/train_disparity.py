@@ -118,20 +118,24 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
         optimiser.load_state_dict(state["optimiser"])
         step, best = state["step"], state["best"]
         _cut_log(out / "log.csv", step)
-    started, seen, total = time.perf_counter(), 0, 0.0
+    started, seen, total, skipped = time.perf_counter(), 0, 0.0, 0
     for batch in _stream(training.recipe, step, training.steps, training.workers):
         for group in optimiser.param_groups:
             group["lr"] = _rate(training, step)
-        total += _step(net, optimiser, _to(batch, where), where)
-        step, seen = step + 1, seen + 1
+        value = _step(net, optimiser, _to(batch, where), where)
+        if value is None:
+            skipped += 1
+        else:
+            total, seen = total + value, seen + 1
+        step += 1
         average.update(net, step)
         timed_out = training.hours is not None and time.perf_counter() - started > training.hours * 3600
         if step % training.every == 0 or step == training.steps or timed_out:
             figures = validate(average.net, training.recipe, where)
-            row = {"step": step, "loss": total / seen, "seconds": time.perf_counter() - started, **figures}
+            row = {"step": step, "loss": total / max(seen, 1), "skipped": skipped, "seconds": time.perf_counter() - started, **figures}
             _log(out / "log.csv", row)
             report(" ".join(f"{k} {v:.4g}" for k, v in row.items()))
-            total, seen = 0.0, 0
+            total, seen, skipped = 0.0, 0, 0
             if figures["pair_bad1"] + figures["views_bad1"] < best:
                 best = figures["pair_bad1"] + figures["views_bad1"]
                 save_weights(average.net, out / "best.safetensors", {"step": str(step)})
@@ -143,15 +147,17 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     return out / "best.safetensors"
 
 
-def _step(net: DisparityNet, optimiser: torch.optim.Optimizer, batch: Batch, device: torch.device) -> float:
+def _step(net: DisparityNet, optimiser: torch.optim.Optimizer, batch: Batch, device: torch.device) -> float | None:
+    """One batch; the loss, or nothing where a gradient was not finite and the weights were left alone."""
     optimiser.zero_grad(set_to_none=True)
     with precision(device):
         output = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
         value = loss(output, batch.inverse, batch.low, batch.high)
     value.backward()
     norm = nn.utils.clip_grad_norm_(net.parameters(), 2.0)
-    if torch.isfinite(norm):
-        optimiser.step()
+    if not torch.isfinite(norm):
+        return None
+    optimiser.step()
     return float(value.detach())
 
 

@@ -3,6 +3,7 @@
 mod convert;
 mod depth;
 mod files;
+mod nurbs;
 mod sparse;
 mod texture;
 mod volume;
@@ -15,6 +16,11 @@ mod _core {
     use crate::depth::{aggregate, refine, sweep};
     #[pymodule_export]
     use crate::files::{encode_png, read_obj};
+    #[pymodule_export]
+    use crate::nurbs::{
+        nurbs_basis, nurbs_control_gradient, nurbs_curve, nurbs_curve_control_gradient, nurbs_curve_knot_gradient, nurbs_knot_gradient,
+        nurbs_surface, nurbs_surface_grid, nurbs_surface_partials,
+    };
     #[pymodule_export]
     use crate::sparse::match_epipolar;
     #[pymodule_export]

@@ -2,7 +2,7 @@
 //!
 //! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`]) ← one file a kernel. Four kernels stand on a part
 //! of their own: [`slanted`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`]; no other calls
-//! another. Threads come from rayon's global pool; every kernel gives the same bytes for any number of them.
+//! another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's global pool; every kernel gives the same bytes for any number of them.
 
 pub mod aggregate;
 pub mod atlas;
@@ -17,6 +17,7 @@ pub mod match_epipolar;
 pub mod memory;
 pub mod mesh;
 pub mod nearest;
+pub mod nurbs;
 pub mod patch;
 pub mod raster;
 pub mod rasterize;
