@@ -30,7 +30,10 @@ pub fn triangle(order: usize) -> Vec<Derivative> {
 
 /// The slots' rows for each chunk of points: `parts[chunk][n]` belongs to `wanted[n]`.
 fn split<'a>(out: &'a mut [f64], wanted: &[Derivative], slot: usize, chunk: usize) -> Vec<Vec<&'a mut [f64]>> {
-    let mut slots: Vec<Option<&mut [f64]>> = out.chunks_mut(slot.max(1)).map(Some).collect();
+    if slot == 0 {
+        return Vec::new();
+    }
+    let mut slots: Vec<Option<&mut [f64]>> = out.chunks_mut(slot).map(Some).collect();
     let mut parts: Vec<Vec<&mut [f64]>> = Vec::new();
     for d in wanted {
         for (n, part) in slots[d.slot].take().unwrap_or_default().chunks_mut(chunk).enumerate() {

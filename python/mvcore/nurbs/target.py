@@ -1,0 +1,249 @@
+"""A target's surface as one NURBS surface: cross-sections along an axis, closed curves, skinned, refined until a tolerance holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import ReconstructionError, require
+from .checks import Array, floats
+from .fit import approximate_rows, closed_fit, spaced_knots
+from .surface import Surface
+
+_SAMPLES = 4
+"""Sections and points of a section for each control point."""
+_CAP = (0.0, 0.35, 0.7, 0.9)
+"""Shares of the end sections that close the ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetFit:
+    """What `fit_target` found.
+
+    surface : closed in u, collapsed to a point at both ends of v.
+    max_deviation, rms_deviation : from the target's points to the surface, in the target's units.
+    control_points : how many. converged : whether the tolerance holds.
+    ignored : share of the sections' length that lies in loops other than each section's largest, which one surface cannot follow.
+    """
+
+    surface: Surface
+    max_deviation: float
+    rms_deviation: float
+    control_points: int
+    converged: bool
+    ignored: float
+
+
+def fit_target(
+    target: Any,
+    tolerance: float,
+    *,
+    axis: ArrayLike | None = None,
+    max_control_points: int = 40_000,
+    degree: int = 3,
+    samples: int = 20_000,
+) -> TargetFit:
+    """One closed NURBS surface fitted to a mesh or a point cloud (paper section 2.2; Piegl and Tiller section 10.3).
+
+    Parameters
+    ----------
+    target : a trimesh.Trimesh, a `Reconstruction` or anything else with ``vertices`` and ``faces``; or points (N, 3).
+    tolerance : greatest deviation allowed, in the target's units.
+    axis : direction across the sections; by default the target's longest principal axis.
+    max_control_points : where refinement ends although the tolerance does not hold.
+    samples : points of the target at which the deviation is measured, besides a mesh's vertices.
+
+    A section that falls into several loops is followed along its largest one: wheels, handles and holes stay outside the surface, and
+    the reported deviation tells. Raises `ReconstructionError` where the target has no closed section.
+    """
+    require(np.isfinite(tolerance) and tolerance > 0, "tolerance", "a positive value", tolerance)
+    require(max_control_points >= 64, "max_control_points", "at least 64", max_control_points)
+    vertices, faces = _target(target)
+    frame = _frame(vertices, axis)
+    middle = vertices.mean(0)
+    local = (vertices - middle) @ frame.T
+    wanted = _measured(vertices, faces, samples)
+    count_u, count_v = 12, 8
+    best: TargetFit | None = None
+    while count_u * count_v <= max_control_points:
+        loops, ignored = _sections(local, faces, _SAMPLES * count_v, _SAMPLES * count_u)
+        surface = _skinned(loops @ frame + middle, count_u, count_v, degree)
+        distance = surface.closest_point(wanted)[3]
+        size = surface.control_points.shape[0] * surface.control_points.shape[1]
+        rms, greatest = float(np.sqrt((distance**2).mean())), float(distance.max())
+        found = TargetFit(surface, greatest, rms, size, greatest <= tolerance, ignored)
+        if best is None or greatest < best.max_deviation:
+            best = found
+        if found.converged:
+            return found
+        # The finer of the two spacings waits for the other.
+        around, along = _spacing(loops)
+        if around / count_u >= along / count_v:
+            count_u = int(count_u * 1.5)
+        else:
+            count_v = int(count_v * 1.5)
+    assert best is not None
+    return best
+
+
+def _target(target: Any) -> tuple[Array, NDArray[np.int64] | None]:
+    target = getattr(target, "mesh", target)
+    if hasattr(target, "vertices") and hasattr(target, "faces"):
+        vertices, faces = floats(target.vertices, "target.vertices", 2), np.asarray(target.faces, np.int64)
+        require(len(faces) > 0 and faces.shape[1:] == (3,), "target.faces", "triangles", faces.shape)
+    else:
+        vertices, faces = floats(target, "target", 2), None
+    require(vertices.shape[1] == 3 and len(vertices) >= 16, "target", "at least 16 points of three coordinates", vertices.shape)
+    return vertices, faces
+
+
+def _frame(vertices: Array, axis: ArrayLike | None) -> Array:
+    """Rows: two directions in the sections' plane, then the axis."""
+    if axis is None:
+        values, vectors = np.linalg.eigh(np.cov(vertices.T))
+        z = vectors[:, values.argmax()]
+        z = z * np.sign(z[np.abs(z).argmax()])
+    else:
+        z = floats(axis, "axis", 1)
+        require(z.shape == (3,) and np.linalg.norm(z) > 0, "axis", "a non-zero 3-vector", z)
+        z = z / np.linalg.norm(z)
+    x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _measured(vertices: Array, faces: NDArray[np.int64] | None, samples: int) -> Array:
+    """Points of the target: its vertices, thinned, and points spread evenly over its faces."""
+    random = np.random.default_rng(0)
+    if faces is None:
+        return vertices[random.permutation(len(vertices))[:samples]]
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    pick = random.choice(len(faces), samples, p=area / area.sum())
+    a, b = np.sqrt(random.random(samples)), random.random(samples)
+    share = np.stack([1 - a, a * (1 - b), a * b], 1)
+    used = np.unique(faces)
+    return np.concatenate([np.einsum("ns,nsk->nk", share, corners[pick]), vertices[random.permutation(used)[:samples]]])
+
+
+def _sections(local: Array, faces: NDArray[np.int64] | None, count: int, points: int) -> tuple[Array, float]:
+    """(rows, points, 3) loops along the axis, the first and last collapsed, and the share of length ignored."""
+    low, high = local[:, 2].min(), local[:, 2].max()
+    # Closer together towards the ends, where a rounded target's sections change fastest.
+    share = (1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2
+    heights = low + (high - low) * share
+    loops, kept, total = [], 0.0, 0.0
+    for z in heights:
+        loop, own, every = _slab(local, z, (high - low) / count) if faces is None else _largest_loop(local, faces, z)
+        total, kept = total + every, kept + own
+        if loop is not None:
+            loops.append(np.column_stack([_resampled(loop, points), np.full(points, z)]))
+    if len(loops) < 4:
+        raise ReconstructionError(f"the target has closed sections at {len(loops)} of {count} heights; at least 4 are needed")
+    for n in range(1, len(loops)):
+        loops[n] = _aligned(loops[n], loops[n - 1])
+    ends = []
+    for loop, z in ((loops[0], low), (loops[-1], high)):
+        tip = local[np.abs(local[:, 2] - z) <= 1e-9 * (high - low) + 1e-12].mean(0)
+        # A flat end keeps its outline: the cap is the end section drawn together, at the end's height.
+        ends.append([np.column_stack([tip[:2] + k * (loop[:, :2] - tip[:2]), np.full(points, z)]) for k in _CAP])
+    return np.stack([*ends[0], *loops, *reversed(ends[1])]), 1 - kept / max(total, 1e-300)
+
+
+def _largest_loop(local: Array, faces: NDArray[np.int64], z: float) -> tuple[Array | None, float, float]:
+    """The loop of greatest area in which the plane at height ``z`` cuts the mesh; its length and that of all loops."""
+    above = local[:, 2] > z
+    cut = faces[(above[faces].sum(1) % 3) != 0]
+    edges = np.stack([cut, np.roll(cut, -1, 1)], 2)
+    crossing = above[edges[..., 0]] != above[edges[..., 1]]
+    # Of a face's two crossing edges, the one entered first as the face runs round: from above to below, then from below to above.
+    down = np.argmax(crossing & above[edges[..., 0]], 1)
+    up = np.argmax(crossing & above[edges[..., 1]], 1)
+    n = np.arange(len(cut))
+    start, end = (np.sort(edges[n, k], 1) for k in (up, down))
+    size = len(local)
+    keys = np.concatenate([start[:, 0] * size + start[:, 1], end[:, 0] * size + end[:, 1]])
+    distinct, number = np.unique(keys, return_inverse=True)
+    a, b = distinct // size, distinct % size
+    share = (z - local[a, 2]) / (local[b, 2] - local[a, 2])
+    places = local[a, :2] + share[:, None] * (local[b, :2] - local[a, :2])
+    follow = dict(zip(number[: len(cut)].tolist(), number[len(cut) :].tolist(), strict=True))
+    best, best_area, own, every = None, 0.0, 0.0, 0.0
+    while follow:
+        first, at = follow.popitem()
+        chain = [first]
+        while at in follow:
+            chain.append(at)
+            at = follow.pop(at)
+        loop = places[chain]
+        length = float(np.linalg.norm(loop - np.roll(loop, 1, 0), axis=1).sum())
+        every += length
+        area = _area(loop)
+        if len(chain) >= 3 and at == first and abs(area) > best_area:
+            best, best_area, own = loop if area > 0 else loop[::-1], abs(area), length
+    return best, own, every
+
+
+def _area(loop: Array) -> float:
+    x, y = loop.T
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
+
+
+def _slab(local: Array, z: float, thickness: float) -> tuple[Array | None, float, float]:
+    """The outline of a cloud's points near height ``z``, by angle about their middle: the mean radius of each of up to 360 sectors."""
+    near = local[np.abs(local[:, 2] - z) <= thickness][:, :2]
+    if len(near) < 12:
+        return None, 0.0, 1.0
+    middle = (near.min(0) + near.max(0)) / 2
+    off = near - middle
+    sectors = int(np.clip(len(near) // 4, 12, 360))
+    angle = np.arctan2(off[:, 1], off[:, 0])
+    sector = ((angle + np.pi) / (2 * np.pi) * sectors).astype(int) % sectors
+    filled = np.unique(sector)
+    if len(filled) < sectors // 2:
+        return None, 0.0, 1.0
+    sums = np.stack([np.bincount(sector, off[:, k], sectors) for k in (0, 1)], 1)[filled]
+    loop = middle + sums / np.bincount(sector, minlength=sectors)[filled, None]
+    return loop, 1.0, 1.0
+
+
+def _resampled(loop: Array, points: int) -> Array:
+    """Evenly spaced points along a closed polyline, beginning where it crosses the ray from its middle along x."""
+    closed = np.concatenate([loop, loop[:1]])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    off = closed[:-1] - loop.mean(0)
+    start = length[np.abs(np.arctan2(off[:, 1], off[:, 0])).argmin()]
+    at = (start + np.arange(points) / points * length[-1]) % length[-1]
+    return np.stack([np.interp(at, length, closed[:, k]) for k in (0, 1)], 1)
+
+
+def _aligned(loop: Array, before: Array) -> Array:
+    """The loop begun where it lies nearest to the one before it, point by point."""
+    a, b = (np.fft.fft(x[:, :2] - x[:, :2].mean(0), axis=0) for x in (loop, before))
+    match = np.fft.ifft((a * b.conj()).sum(1)).real
+    return np.roll(loop, -int(match.argmax()), 0)
+
+
+def _spacing(loops: Array) -> tuple[float, float]:
+    """Greatest length around a section, and the mean length along the rows."""
+    around = np.linalg.norm(loops - np.roll(loops, 1, 1), axis=2).sum(1).max()
+    along = np.linalg.norm(np.diff(loops, axis=0), axis=2).sum(0).mean()
+    return float(around), float(along)
+
+
+def _skinned(rows: Array, count_u: int, count_v: int, degree: int) -> Surface:
+    """Closed curves fitted to the rows, then a fit across them."""
+    u = np.arange(rows.shape[1]) / rows.shape[1]
+    flat = rows.transpose(1, 0, 2).reshape(rows.shape[1], -1)
+    around = closed_fit(u, flat, count_u, degree)
+    steps = np.linalg.norm(np.diff(rows, axis=0), axis=2).mean(1)
+    v = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-9 * steps.sum()))])
+    v /= v[-1]
+    curves = np.asarray(around.control_points).reshape(-1, len(rows), 3)
+    count_v = min(count_v + 2 * len(_CAP), len(rows))
+    knots = spaced_knots(v, count_v, degree)
+    net = approximate_rows(v, curves.transpose(1, 0, 2).reshape(len(rows), -1), knots, count_v)
+    return Surface(net.reshape(count_v, -1, 3).transpose(1, 0, 2), around.knots, knots)
