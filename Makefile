@@ -42,6 +42,7 @@ bench: ## throughput of each kernel
 peers: build ## each kernel beside what a user would pick instead
 	$(BIN)/pip install --quiet '.[peers]'
 	$(BIN)/python benches/peers.py
+	$(BIN)/python benches/nurbs_peers.py
 
 format: build ## rewrite the sources in the project's format
 	cargo fmt --all

@@ -13,7 +13,8 @@ use mvcore::grid::Grid;
 use mvcore::isosurface::{isosurface_dense, isosurface_sparse};
 use mvcore::match_epipolar::{DESCRIPTOR, Features, match_epipolar};
 use mvcore::mesh::Mesh;
-use mvcore::nearest::nearest_distance;
+use mvcore::nearest::nearest;
+use mvcore::nurbs::{self, Knots, Net};
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::rasterize::rasterize;
 use mvcore::select_views::{Photo, SelectParams, rate, select_views};
@@ -239,7 +240,7 @@ fn meshes(c: &mut Criterion) {
     group.bench_function("build_atlas, 8 views", |b| b.iter(|| build_atlas(mesh, &labels, &sources, 8192).unwrap()));
     group.throughput(Throughput::Elements(vertices.len() as u64));
     let shifted: Vec<[f64; 3]> = vertices.iter().map(|v| v.map(|x| x * 1.01)).collect();
-    group.bench_function("nearest_distance", |b| b.iter(|| nearest_distance(&shifted, &vertices).unwrap()));
+    group.bench_function("nearest", |b| b.iter(|| nearest(&shifted, &vertices).unwrap()));
     group.finish();
 }
 
@@ -262,5 +263,28 @@ fn features(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, features, stereo, volumes, meshes);
+/// A bicubic 50 x 50 net; a million scattered points with 6 derivatives write 144 MB, the floor.
+fn splines(c: &mut Criterion) {
+    let mut random = Random(7);
+    let knots: Vec<f64> = (0..54).map(|i| (f64::from(i) - 3.0).clamp(0.0, 47.0) / 47.0).collect();
+    let axis = Knots::new("knots", &knots, 50).unwrap();
+    let control: Vec<f64> = (0..7500).map(|_| random.next()).collect();
+    let net = Net::new("control_points", &control, 50, 50, 3, false).unwrap();
+    let (u, v): (Vec<f64>, Vec<f64>) = (0..1_000_000).map(|_| (random.next(), random.next())).unzip();
+    let g: Vec<f64> = (0..3_000_000).map(|_| random.next()).collect();
+    let line: Vec<f64> = (0..1000).map(|i| f64::from(i) / 999.0).collect();
+    let wanted = nurbs::triangle(2);
+    let mut group = c.benchmark_group("nurbs, a million points");
+    group.sample_size(10).throughput(Throughput::Elements(1_000_000));
+    group.bench_function("scattered, second derivatives", |b| {
+        b.iter(|| nurbs::surface_points(&net, [&axis, &axis], &u, &v, &wanted, 9).unwrap());
+    });
+    group.bench_function("grid", |b| b.iter(|| nurbs::surface_grid(&net, [&axis, &axis], &line, &line, 0).unwrap()));
+    group.bench_function("gradient to control points", |b| {
+        b.iter(|| nurbs::control_gradient([&axis, &axis], &u, &v, &g, 3, [0, 0]).unwrap());
+    });
+    group.finish();
+}
+
+criterion_group!(benches, features, stereo, volumes, meshes, splines);
 criterion_main!(benches);

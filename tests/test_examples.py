@@ -7,11 +7,12 @@ import runpy
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from conftest import ROOT, write_scene
 
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem != "03_nurbs")
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,15 @@ def test_an_example_runs(path, small, tmp_path):
     assert (tmp_path / f"a{suffix}").stat().st_size > 1000
 
 
+def test_the_nurbs_example_draws_a_picture(tmp_path):
+    command = [sys.executable, str(ROOT / "examples" / "03_nurbs.py"), str(tmp_path / "a.png")]
+    out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "within the tolerance" in out
+    picture = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_GRAYSCALE)
+    assert 0.1 < (picture < 250).mean() < 0.6
+    assert (tmp_path / "nurbs.step").is_file()
+
+
 @pytest.mark.parametrize("module", ["cameras", "config", "depth", "surface"])
 def test_docstrings(module):
     result = doctest.testmod(importlib.import_module(f"mvcore.{module}"), extraglobs={"np": np})
@@ -36,7 +46,7 @@ def test_docstrings(module):
 
 def test_the_readme_code(small, tmp_path, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fountain").symlink_to(small)
     for n, block in enumerate(blocks):

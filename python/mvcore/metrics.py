@@ -64,7 +64,7 @@ def nearest_distance(points: Float, others: Float) -> Float:
     """Distance of each point (n, 3) to the nearest of ``others`` (m, 3), (n,); infinite if there are none."""
     if not len(others):
         return np.full(len(points), np.inf)
-    return _core.nearest_distance(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(others, np.float64))
+    return _core.nearest(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(others, np.float64))[0]
 
 
 def mesh_metrics(
@@ -89,7 +89,7 @@ def mesh_metrics(
     to_truth = nearest_distance(found, true)
     if visible is not None:
         seen = np.asarray(visible, np.float64)
-        spacing = np.median(_core.nearest_distance(seen[::2].copy(), seen[1::2].copy()))
+        spacing = np.median(nearest_distance(seen[::2], seen[1::2]))
         counts = nearest_distance(found, seen) < to_truth + 4 * spacing
         to_truth = to_truth[counts]
         true = seen

@@ -11,7 +11,17 @@ from .. import _core
 from ..errors import require
 from . import edit
 from .checks import (
-    Array, Outside, affine, checked_insertion, checked_weights, floats, frozen, homogeneous, parameters, plain, removal_scale,
+    Array,
+    Outside,
+    affine,
+    checked_insertion,
+    checked_weights,
+    floats,
+    frozen,
+    homogeneous,
+    parameters,
+    plain,
+    removal_scale,
 )
 from .search import between, descend, extremes, nearest, sampled, subdivided
 
@@ -210,4 +220,3 @@ class Curve:
     def _with(self, knots: Array, rows: Array) -> Curve:
         control, weights = plain(rows, self.weights is not None)
         return Curve(control, knots, weights)
-

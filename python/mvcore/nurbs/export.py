@@ -26,8 +26,8 @@ Shape = Curve | Surface
 def tessellate(surface: Surface, tolerance: float, *, max_vertices: int = 4_000_000) -> tuple[Array, NDArray[np.int64], Array]:
     """Vertices (N, dim), triangles (F, 3) and parameters (N, 2) of a mesh nowhere farther than ``tolerance`` from the surface.
 
-    Each span is cut as finely as its second derivatives ask for, then lines are added where the surface still leaves the middle of an edge or
-    cell by more than the tolerance. Counter-clockwise about S_u x S_v. Edges that meet, and poles, share vertices.
+    Each span is cut as finely as its second derivatives ask for, then lines are added where the surface still leaves the middle of an
+    edge or cell by more than the tolerance. Counter-clockwise about S_u x S_v. Edges that meet, and poles, share vertices.
     """
     require(np.isfinite(tolerance) and tolerance > 0, "tolerance", "a positive value", tolerance)
     axes = [_estimated(surface, d, tolerance) for d in (0, 1)]
@@ -69,7 +69,7 @@ def _estimated(surface: Surface, axis: int, tolerance: float) -> Array:
     other = breaks[1 - axis]
     across = np.sort(np.concatenate([other, subdivided(other, 3)]))
     pair = (along.ravel(), across) if axis == 0 else (across, along.ravel())
-    second = surface.derivatives_grid(*pair, 2)[(2, 0) if axis == 0 else (0, 2)]
+    second = surface.derivatives_grid(pair[0], pair[1], 2)[(2, 0) if axis == 0 else (0, 2)]
     second = np.linalg.norm(second, axis=2)
     worst = (second.max(1) if axis == 0 else second.max(0)).reshape(along.shape).max(1)
     pieces = np.ceil(np.diff(own) * np.sqrt(worst * 3 / (8 * tolerance))).clip(1, 4096).astype(int)
@@ -119,7 +119,9 @@ def save_obj(path: str | os.PathLike[str], shapes: Shape | Iterable[Shape]) -> N
     many = _shapes(shapes)
     lines, used = ["# NURBS written by mvcore"], 0
     for n, shape in enumerate(many):
-        control = shape.control_points.reshape(-1, 3) if isinstance(shape, Curve) else shape.control_points.transpose(1, 0, 2).reshape(-1, 3)
+        control = (
+            shape.control_points.reshape(-1, 3) if isinstance(shape, Curve) else shape.control_points.transpose(1, 0, 2).reshape(-1, 3)
+        )
         weights = None if shape.weights is None else shape.weights.T.ravel()
         # With weights a vertex line is x y z w; evaluators divide, so x y z are the points themselves.
         for k, point in enumerate(control):

@@ -66,7 +66,7 @@ def gram(knots: Array, count: int, order: int) -> Array:
 
 def interpolate_rows(u: Array, values: Array, knots: Array) -> Array:
     """Control rows (n, K) of the spline that takes ``values`` (n, K) at ``u`` (A9.1)."""
-    return np.linalg.solve(collocation(knots, len(u), u), values)
+    return np.asarray(np.linalg.solve(collocation(knots, len(u), u), values), np.float64)
 
 
 def approximate_rows(
@@ -114,9 +114,7 @@ def _given(parameters: ArrayLike | None, points: Array, method: Method) -> Array
     return u
 
 
-def interpolate_curve(
-    points: ArrayLike, degree: int = 3, *, parameters: ArrayLike | None = None, method: Method = "centripetal"
-) -> Curve:
+def interpolate_curve(points: ArrayLike, degree: int = 3, *, parameters: ArrayLike | None = None, method: Method = "centripetal") -> Curve:
     """The spline curve through points (n, dim) in order (A9.1)."""
     p = floats(points, "points", 2)
     degree = _degree(degree, len(p))
@@ -269,10 +267,7 @@ def fit_scattered(
     else:
         ku, kv = floats(knots[0], "knots_u", 1), floats(knots[1], "knots_v", 1)
     lengths = [k[-d - 1] - k[d] for k, d in zip((ku, kv), degrees, strict=True)]
-    grams = [
-        [gram(k, c, o) * length ** (2 * o - 1) for o in range(3)]
-        for k, c, length in zip((ku, kv), counts, lengths, strict=True)
-    ]
+    grams = [[gram(k, c, o) * length ** (2 * o - 1) for o in range(3)] for k, c, length in zip((ku, kv), counts, lengths, strict=True)]
 
     def energy(net: Array) -> Array:
         terms = ((2, 0, 1.0), (1, 1, 2.0), (0, 2, 1.0))

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
+
 Array = NDArray[np.float64]
 
 
@@ -27,15 +29,17 @@ def between(breaks: Array, pieces: int) -> Array:
     return (edges[:-1] + edges[1:]) / 2
 
 
-def nearest(points: Array, wanted: Array, size: int = 1 << 22) -> NDArray[np.intp]:
+def nearest(points: Array, wanted: Array, size: int = 1 << 22) -> NDArray[np.int64]:
     """Number of the point nearest to each wanted one."""
-    found = np.empty(len(wanted), np.intp)
+    dim = points.shape[1]
+    if dim <= 3:
+        return _core.nearest(*(np.pad(x, ((0, 0), (0, 3 - dim))) for x in (wanted, points)))[1]
+    found = np.empty(len(wanted), np.int64)
     squares = (points**2).sum(1)
     step = max(1, size // max(1, len(points)))
     for k in range(0, len(wanted), step):
         found[k : k + step] = (squares - 2 * wanted[k : k + step] @ points.T).argmin(1)
     return found
-
 
 
 def descend(

@@ -153,7 +153,7 @@ def loft(curves: Sequence[Curve], degree: int = 3, parameters: ArrayLike | None 
     parameters : v of each curve, ascending from 0 to 1; by default from the mean distance between their control points.
     """
     require(len(curves) >= 2, "curves", "at least two curves", len(curves))
-    require(1 <= degree, "degree", "at least 1", degree)
+    require(degree >= 1, "degree", "at least 1", degree)
     degree = min(degree, len(curves) - 1)
     knots, points, rational = compatible(curves)
     if parameters is None:

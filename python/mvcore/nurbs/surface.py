@@ -13,7 +13,17 @@ from .. import _core
 from ..errors import require
 from . import edit
 from .checks import (
-    Array, Outside, affine, checked_insertion, checked_weights, floats, frozen, homogeneous, parameters, plain, removal_scale,
+    Array,
+    Outside,
+    affine,
+    checked_insertion,
+    checked_weights,
+    floats,
+    frozen,
+    homogeneous,
+    parameters,
+    plain,
+    removal_scale,
 )
 from .curve import Curve
 from .search import between, descend, extremes, nearest, sampled, subdivided
@@ -189,9 +199,7 @@ class Surface:
 
         slope = np.stack([dot(su, off), dot(sv, off)], 1)
         first = np.stack([np.stack([dot(su, su), dot(su, sv)], 1), np.stack([dot(su, sv), dot(sv, sv)], 1)], 1)
-        second = np.stack(
-            [np.stack([dot(d[2, 0], off), dot(d[1, 1], off)], 1), np.stack([dot(d[1, 1], off), dot(d[0, 2], off)], 1)], 1
-        )
+        second = np.stack([np.stack([dot(d[2, 0], off), dot(d[1, 1], off)], 1), np.stack([dot(d[1, 1], off), dot(d[0, 2], off)], 1)], 1)
         # Newton where the Hessian is safely positive, Gauss-Newton elsewhere; at the domain's edge only the free parameter moves.
         hessian = first + second
         safe = (hessian[:, 0, 0] > 1e-3 * first[:, 0, 0]) & (np.linalg.det(hessian) > 1e-3 * np.linalg.det(first))

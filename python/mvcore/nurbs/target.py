@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ReconstructionError, require
+from ..metrics import sample_surface
 from .checks import Array, floats
 from .fit import approximate_rows, closed_fit, spaced_knots
 from .surface import Surface
 
 _SAMPLES = 4
 """Sections and points of a section for each control point."""
+_WHOLE = 0.5
+"""Share of a section's length that its largest loop must have to stand for it."""
 _CAP = (0.0, 0.35, 0.7, 0.9)
 """Shares of the end sections that close the ends."""
 
@@ -65,7 +68,9 @@ def fit_target(
     frame = _frame(vertices, axis)
     middle = vertices.mean(0)
     local = (vertices - middle) @ frame.T
-    wanted = _measured(vertices, faces, samples)
+    wanted = sample_surface((vertices, None), samples)
+    if faces is not None:
+        wanted = np.concatenate([wanted, sample_surface((vertices, faces.astype(np.uint32)), samples)])
     count_u, count_v = 12, 8
     best: TargetFit | None = None
     while count_u * count_v <= max_control_points:
@@ -94,6 +99,10 @@ def _target(target: Any) -> tuple[Array, NDArray[np.int64] | None]:
     if hasattr(target, "vertices") and hasattr(target, "faces"):
         vertices, faces = floats(target.vertices, "target.vertices", 2), np.asarray(target.faces, np.int64)
         require(len(faces) > 0 and faces.shape[1:] == (3,), "target.faces", "triangles", faces.shape)
+        require(faces.min() >= 0 and faces.max() < len(vertices), "target.faces", f"numbers below {len(vertices)}", faces.max())
+        # Where a texture's seam runs a mesh has two vertices in one place; sections must run on.
+        vertices, joined = np.unique(vertices, axis=0, return_inverse=True)
+        faces = joined.reshape(-1)[faces]
     else:
         vertices, faces = floats(target, "target", 2), None
     require(vertices.shape[1] == 3 and len(vertices) >= 16, "target", "at least 16 points of three coordinates", vertices.shape)
@@ -113,20 +122,6 @@ def _frame(vertices: Array, axis: ArrayLike | None) -> Array:
     x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
-
-
-def _measured(vertices: Array, faces: NDArray[np.int64] | None, samples: int) -> Array:
-    """Points of the target: its vertices, thinned, and points spread evenly over its faces."""
-    random = np.random.default_rng(0)
-    if faces is None:
-        return vertices[random.permutation(len(vertices))[:samples]]
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    pick = random.choice(len(faces), samples, p=area / area.sum())
-    a, b = np.sqrt(random.random(samples)), random.random(samples)
-    share = np.stack([1 - a, a * (1 - b), a * b], 1)
-    used = np.unique(faces)
-    return np.concatenate([np.einsum("ns,nsk->nk", share, corners[pick]), vertices[random.permutation(used)[:samples]]])
 
 
 def _sections(local: Array, faces: NDArray[np.int64] | None, count: int, points: int) -> tuple[Array, float]:
@@ -154,7 +149,10 @@ def _sections(local: Array, faces: NDArray[np.int64] | None, count: int, points:
 
 
 def _largest_loop(local: Array, faces: NDArray[np.int64], z: float) -> tuple[Array | None, float, float]:
-    """The loop of greatest area in which the plane at height ``z`` cuts the mesh; its length and that of all loops."""
+    """The loop of greatest area in which the plane at height ``z`` cuts the mesh; its length and that of all loops.
+
+    Where that is a minor part, as in an open mesh or among many parts, the outline of the whole section stands in.
+    """
     above = local[:, 2] > z
     cut = faces[(above[faces].sum(1) % 3) != 0]
     edges = np.stack([cut, np.roll(cut, -1, 1)], 2)
@@ -171,7 +169,8 @@ def _largest_loop(local: Array, faces: NDArray[np.int64], z: float) -> tuple[Arr
     share = (z - local[a, 2]) / (local[b, 2] - local[a, 2])
     places = local[a, :2] + share[:, None] * (local[b, :2] - local[a, :2])
     follow = dict(zip(number[: len(cut)].tolist(), number[len(cut) :].tolist(), strict=True))
-    best, best_area, own, every = None, 0.0, 0.0, 0.0
+    best: Array | None = None
+    best_area, own, every = 0.0, 0.0, 0.0
     while follow:
         first, at = follow.popitem()
         chain = [first]
@@ -184,6 +183,8 @@ def _largest_loop(local: Array, faces: NDArray[np.int64], z: float) -> tuple[Arr
         area = _area(loop)
         if len(chain) >= 3 and at == first and abs(area) > best_area:
             best, best_area, own = loop if area > 0 else loop[::-1], abs(area), length
+    if own < _WHOLE * every:
+        best = _outline(places, np.maximum) if len(places) >= 12 else None
     return best, own, every
 
 
@@ -193,21 +194,27 @@ def _area(loop: Array) -> float:
 
 
 def _slab(local: Array, z: float, thickness: float) -> tuple[Array | None, float, float]:
-    """The outline of a cloud's points near height ``z``, by angle about their middle: the mean radius of each of up to 360 sectors."""
+    """The outline of a cloud's points near height ``z``."""
     near = local[np.abs(local[:, 2] - z) <= thickness][:, :2]
-    if len(near) < 12:
-        return None, 0.0, 1.0
-    middle = (near.min(0) + near.max(0)) / 2
-    off = near - middle
-    sectors = int(np.clip(len(near) // 4, 12, 360))
-    angle = np.arctan2(off[:, 1], off[:, 0])
-    sector = ((angle + np.pi) / (2 * np.pi) * sectors).astype(int) % sectors
-    filled = np.unique(sector)
-    if len(filled) < sectors // 2:
-        return None, 0.0, 1.0
-    sums = np.stack([np.bincount(sector, off[:, k], sectors) for k in (0, 1)], 1)[filled]
-    loop = middle + sums / np.bincount(sector, minlength=sectors)[filled, None]
-    return loop, 1.0, 1.0
+    loop = _outline(near, np.add) if len(near) >= 12 else None
+    return loop, float(loop is not None), 1.0
+
+
+def _outline(points: Array, join: np.ufunc) -> Array | None:
+    """A closed polyline about points (n, 2) by angle: in each sector their mean (``np.add``) or the farthest (``np.maximum``)."""
+    middle = (points.min(0) + points.max(0)) / 2
+    off = points - middle
+    sectors = int(np.clip(len(points) // 4, 12, 360))
+    sector = ((np.arctan2(off[:, 1], off[:, 0]) + np.pi) / (2 * np.pi) * sectors).astype(int) % sectors
+    radius = np.zeros(sectors)
+    join.at(radius, sector, np.linalg.norm(off, axis=1))
+    count = np.bincount(sector, minlength=sectors)
+    filled = np.flatnonzero(count)
+    if len(filled) < sectors // 3:
+        return None
+    radius = radius[filled] / (count[filled] if join is np.add else 1)
+    angle = (filled + 0.5) / sectors * 2 * np.pi - np.pi
+    return np.asarray(middle + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1))
 
 
 def _resampled(loop: Array, points: int) -> Array:

@@ -1,7 +1,7 @@
 """NURBS under autograd: gradients to control points, weights, parameters and knots (paper eqs 13-31; the only part that imports torch).
 
-The Rust kernels serve forward and backward, in float64 on the CPU. Evaluation and its adjoint are linear in the control points and each is the
-other's gradient, so gradients of gradients exist too; those to the knots are of first order only.
+The Rust kernels serve forward and backward, in float64 on the CPU. Evaluation and its adjoint are linear in the control points and
+each is the other's gradient, so gradients of gradients exist too; those to the knots are of first order only.
 """
 
 from __future__ import annotations
@@ -178,9 +178,7 @@ def evaluate_curve(control_points: Tensor, knots: Tensor, u: Tensor, *, weights:
     return out if weights is None else out[:, :-1] / out[:, -1:]
 
 
-def surface_derivative(
-    control_points: Tensor, knots_u: Tensor, knots_v: Tensor, u: Tensor, v: Tensor, orders: tuple[int, int]
-) -> Tensor:
+def surface_derivative(control_points: Tensor, knots_u: Tensor, knots_v: Tensor, u: Tensor, v: Tensor, orders: tuple[int, int]) -> Tensor:
     """Derivative of a surface without weights, ``orders`` times along u and v, (N, dim); differentiable but to the knots."""
     _checked(3, control_points=control_points, knots_u=knots_u, knots_v=knots_v, u=u, v=v)
     require(min(orders) >= 0, "orders", "no negative value", orders)
@@ -188,7 +186,7 @@ def surface_derivative(
 
 
 def monotone_knots(spans: Tensor, degree: int, *, least: float = 1e-3) -> Tensor:
-    """Clamped knots over 0 .. 1 whose spans are the softmax of ``spans`` (any real numbers, one a span), each at least ``least`` of the mean.
+    """Clamped knots over 0 .. 1 whose spans are the softmax of ``spans`` (real numbers, one a span), each at least ``least`` of the mean.
 
     What lets an optimiser move knots: they stay ascending and apart whatever it does.
     """

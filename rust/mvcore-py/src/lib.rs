@@ -18,13 +18,13 @@ mod _core {
     use crate::files::{encode_png, read_obj};
     #[pymodule_export]
     use crate::nurbs::{
-        nurbs_basis, nurbs_control_gradient, nurbs_curve, nurbs_curve_control_gradient, nurbs_curve_knot_gradient, nurbs_knot_gradient,
-        nurbs_surface, nurbs_surface_grid, nurbs_surface_partials,
+        nurbs_basis, nurbs_control_gradient, nurbs_curve, nurbs_curve_control_gradient, nurbs_curve_knot_gradient,
+        nurbs_knot_gradient, nurbs_surface, nurbs_surface_grid, nurbs_surface_partials,
     };
     #[pymodule_export]
     use crate::sparse::match_epipolar;
     #[pymodule_export]
     use crate::texture::{build_atlas, rasterize, rate_faces, select_views, shade};
     #[pymodule_export]
-    use crate::volume::{components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest_distance};
+    use crate::volume::{components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest};
 }

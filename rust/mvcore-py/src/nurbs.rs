@@ -3,7 +3,8 @@
 use crate::convert::{array, run, slice};
 use mvcore::nurbs::{self, Derivative, Knots, Net};
 use numpy::{
-    PyArray1, PyArray2, PyArray3, PyArray4, PyArray5, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+    PyArray1, PyArray2, PyArray3, PyArray4, PyArray5, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
+    PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 
@@ -68,7 +69,8 @@ pub fn nurbs_surface<'py>(
     rational: bool,
 ) -> PyResult<Bound<'py, PyArray4<f64>>> {
     let [m, n, dim] = [control.shape()[0], control.shape()[1], control.shape()[2]];
-    let (control, ku, kv) = (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
+    let (control, ku, kv) =
+        (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v) = (slice(&u, "u")?, slice(&v, "v")?);
     let (out, dim) = run(py, || {
         let net = Net::new("control_points", control, m, n, dim, rational)?;
@@ -90,10 +92,10 @@ pub fn nurbs_surface_partials<'py>(
     orders: Vec<(usize, usize)>,
 ) -> PyResult<Bound<'py, PyArray3<f64>>> {
     let [m, n, dim] = [control.shape()[0], control.shape()[1], control.shape()[2]];
-    let (control, ku, kv) = (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
+    let (control, ku, kv) =
+        (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v) = (slice(&u, "u")?, slice(&v, "v")?);
-    let wanted: Vec<Derivative> =
-        orders.iter().enumerate().map(|(slot, &(u, v))| Derivative { u, v, slot }).collect();
+    let wanted: Vec<Derivative> = orders.iter().enumerate().map(|(slot, &(u, v))| Derivative { u, v, slot }).collect();
     let out = run(py, || {
         let net = Net::new("control_points", control, m, n, dim, false)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
@@ -114,7 +116,8 @@ pub fn nurbs_surface_grid<'py>(
     rational: bool,
 ) -> PyResult<Bound<'py, PyArray5<f64>>> {
     let [m, n, dim] = [control.shape()[0], control.shape()[1], control.shape()[2]];
-    let (control, ku, kv) = (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
+    let (control, ku, kv) =
+        (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v) = (slice(&u, "u")?, slice(&v, "v")?);
     let (out, dim) = run(py, || {
         let net = Net::new("control_points", control, m, n, dim, rational)?;
@@ -157,9 +160,7 @@ pub fn nurbs_curve_control_gradient<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let dim = gradient.shape()[1];
     let (knots, u, gradient) = (slice(&knots, "knots")?, slice(&u, "u")?, slice(&gradient, "gradient")?);
-    let out = run(py, || {
-        nurbs::curve_control_gradient(&Knots::new("knots", knots, count)?, u, gradient, dim, order)
-    })?;
+    let out = run(py, || nurbs::curve_control_gradient(&Knots::new("knots", knots, count)?, u, gradient, dim, order))?;
     array(py, out, (count, dim))
 }
 
@@ -174,7 +175,8 @@ pub fn nurbs_knot_gradient<'py>(
     gradient: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>)> {
     let [m, n, dim] = [control.shape()[0], control.shape()[1], control.shape()[2]];
-    let (control, ku, kv) = (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
+    let (control, ku, kv) =
+        (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v, gradient) = (slice(&u, "u")?, slice(&v, "v")?, slice(&gradient, "gradient")?);
     let mut out = run(py, || {
         let net = Net::new("control_points", control, m, n, dim, false)?;

@@ -120,14 +120,14 @@ pub fn components<'py>(
 }
 
 #[pyfunction]
-pub fn nearest_distance<'py>(
+pub fn nearest<'py>(
     py: Python<'py>,
     points: PyReadonlyArray2<'py, f64>,
     others: PyReadonlyArray2<'py, f64>,
-) -> PyResult<Bound<'py, numpy::PyArray1<f64>>> {
+) -> PyResult<(Bound<'py, numpy::PyArray1<f64>>, Bound<'py, numpy::PyArray1<i64>>)> {
     let p = slice(&points, "points")?.as_chunks::<3>().0;
     let q = slice(&others, "others")?.as_chunks::<3>().0;
-    let found = run(py, || mvcore::nearest::nearest_distance(p, q))?;
-    let n = found.len();
-    array(py, found, [n])
+    let (distances, numbers) = run(py, || mvcore::nearest::nearest(p, q))?;
+    let n = distances.len();
+    Ok((array(py, distances, [n])?, array(py, numbers, [n])?))
 }

@@ -1,4 +1,4 @@
-//! Distance of each point to the nearest of another set, exactly, by a grid of cells.
+//! The nearest of a set of points to each of another, and its distance, exactly, by a grid of cells.
 //!
 //! Cells hold a few points each; rings of cells around a query are searched until the next ring is farther than the best found.
 
@@ -8,13 +8,13 @@ use rayon::prelude::*;
 /// Points a cell holds on average.
 const PER_CELL: f64 = 2.0;
 
-/// For each of `points` the distance to the nearest of `others` (not empty).
-pub fn nearest_distance(points: &[[f64; 3]], others: &[[f64; 3]]) -> Result<Vec<f64>> {
+/// For each of `points` the distance to the nearest of `others` (not empty), and its number; of several the lowest.
+pub fn nearest(points: &[[f64; 3]], others: &[[f64; 3]]) -> Result<(Vec<f64>, Vec<i64>)> {
     require(!others.is_empty(), "others", "at least one point", "none")?;
     let finite = |p: &[[f64; 3]]| p.iter().flatten().all(|v| v.is_finite());
     require(finite(points) && finite(others), "points", "finite coordinates", "NaN or infinity")?;
     let cells = Cells::new(others);
-    Ok(points.par_iter().map(|p| cells.nearest(p).sqrt()).collect())
+    Ok(points.par_iter().map(|p| cells.nearest(p)).map(|(square, n)| (square.sqrt(), i64::from(n))).unzip())
 }
 
 struct Cells<'a> {
@@ -69,10 +69,10 @@ impl<'a> Cells<'a> {
         ((c[0] * self.dims[1] + c[1]) * self.dims[2] + c[2]) as usize
     }
 
-    /// Squared distance to the nearest point.
-    fn nearest(&self, p: &[f64; 3]) -> f64 {
+    /// Squared distance to the nearest point, and its number.
+    fn nearest(&self, p: &[f64; 3]) -> (f64, u32) {
         let home = self.cell(p);
-        let mut best = f64::MAX;
+        let mut best = (f64::MAX, 0);
         let reach = self.dims.iter().copied().max().unwrap_or(1);
         for ring in 0..=reach {
             self.search_ring(p, home, ring, &mut best);
@@ -84,14 +84,14 @@ impl<'a> Cells<'a> {
                 })
                 .fold(f64::MAX, f64::min);
             let next = ring as f64 * self.size + inside;
-            if next > 0.0 && best <= next * next {
+            if next > 0.0 && best.0 <= next * next {
                 break;
             }
         }
         best
     }
 
-    fn search_ring(&self, p: &[f64; 3], home: [i64; 3], ring: i64, best: &mut f64) {
+    fn search_ring(&self, p: &[f64; 3], home: [i64; 3], ring: i64, best: &mut (f64, u32)) {
         let span = |k: usize| (home[k] - ring).max(0)..=(home[k] + ring).min(self.dims[k] - 1);
         for i in span(0) {
             for j in span(1) {
@@ -102,7 +102,9 @@ impl<'a> Cells<'a> {
                     for &n in &self.order[self.start[c] as usize..self.start[c + 1] as usize] {
                         let q = &self.points[n as usize];
                         let d = (0..3).map(|k| (p[k] - q[k]).powi(2)).sum::<f64>();
-                        *best = best.min(d);
+                        if d < best.0 || (d == best.0 && n < best.1) {
+                            *best = (d, n);
+                        }
                     }
                 };
                 if shell {
@@ -128,8 +130,10 @@ mod tests {
             flat in any::<bool>(),
         ) {
             let others: Vec<[f64; 3]> = others.into_iter().map(|p| if flat { [p[0], p[1], 0.5] } else { p }).collect();
-            let found = nearest_distance(&points, &others).unwrap();
-            for (p, d) in points.iter().zip(found) {
+            let (distances, numbers) = nearest(&points, &others).unwrap();
+            for ((p, d), n) in points.iter().zip(distances).zip(numbers) {
+                let own = (0..3).map(|k| (p[k] - others[n as usize][k]).powi(2)).sum::<f64>().sqrt();
+                prop_assert!((d - own).abs() < 1e-12);
                 let brute = others.iter().map(|q| (0..3).map(|k| (p[k] - q[k]).powi(2)).sum::<f64>().sqrt());
                 prop_assert!((d - brute.fold(f64::MAX, f64::min)).abs() < 1e-12);
             }
@@ -138,7 +142,7 @@ mod tests {
 
     #[test]
     fn nothing_to_be_near_to_is_an_error() {
-        assert!(nearest_distance(&[[0.0; 3]], &[]).is_err());
-        assert!(nearest_distance(&[], &[[0.0; 3]]).unwrap().is_empty());
+        assert!(nearest(&[[0.0; 3]], &[]).is_err());
+        assert!(nearest(&[], &[[0.0; 3]]).unwrap().0.is_empty());
     }
 }

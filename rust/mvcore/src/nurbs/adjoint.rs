@@ -35,12 +35,7 @@ pub fn control_gradient(
     orders: [usize; 2],
 ) -> Result<Vec<f64>> {
     require(u.len() == v.len(), "v", format!("as many values as u, {}", u.len()), v.len())?;
-    require(
-        gradient.len() == u.len() * dim,
-        "gradient",
-        format!("{} x {dim} values", u.len()),
-        gradient.len(),
-    )?;
+    require(gradient.len() == u.len() * dim, "gradient", format!("{} x {dim} values", u.len()), gradient.len())?;
     knots[0].check("u", u)?;
     knots[1].check("v", v)?;
     let (m, n) = (knots[0].count(), knots[1].count());
@@ -63,7 +58,8 @@ pub fn control_gradient(
         }
         out
     };
-    let parts = u.par_chunks(size).zip(v.par_chunks(size)).zip(gradient.par_chunks((size * dim).max(1))).map(part).collect();
+    let parts =
+        u.par_chunks(size).zip(v.par_chunks(size)).zip(gradient.par_chunks((size * dim).max(1))).map(part).collect();
     Ok(added(parts, m * n * dim))
 }
 
@@ -133,13 +129,14 @@ fn scatter(
 }
 
 /// The adjoint of derivative `order` of a curve, (n, dim).
-pub fn curve_control_gradient(knots: &Knots, u: &[f64], gradient: &[f64], dim: usize, order: usize) -> Result<Vec<f64>> {
-    require(
-        gradient.len() == u.len() * dim,
-        "gradient",
-        format!("{} x {dim} values", u.len()),
-        gradient.len(),
-    )?;
+pub fn curve_control_gradient(
+    knots: &Knots,
+    u: &[f64],
+    gradient: &[f64],
+    dim: usize,
+    order: usize,
+) -> Result<Vec<f64>> {
+    require(gradient.len() == u.len() * dim, "gradient", format!("{} x {dim} values", u.len()), gradient.len())?;
     knots.check("u", u)?;
     let (p, len) = (knots.degree(), knots.count() * dim);
     let size = part_size(u.len(), len);
@@ -161,21 +158,10 @@ pub fn curve_control_gradient(knots: &Knots, u: &[f64], gradient: &[f64], dim: u
 }
 
 /// Gradients with respect to both knot vectors of Σ gradient · S(u, v), from the net's own values: knots of u, then knots of v.
-pub fn knot_gradient(
-    net: &Net,
-    knots: [&Knots; 2],
-    u: &[f64],
-    v: &[f64],
-    gradient: &[f64],
-) -> Result<Vec<f64>> {
+pub fn knot_gradient(net: &Net, knots: [&Knots; 2], u: &[f64], v: &[f64], gradient: &[f64]) -> Result<Vec<f64>> {
     require(u.len() == v.len(), "v", format!("as many values as u, {}", u.len()), v.len())?;
     let dim = net.dim;
-    require(
-        gradient.len() == u.len() * dim,
-        "gradient",
-        format!("{} x {dim} values", u.len()),
-        gradient.len(),
-    )?;
+    require(gradient.len() == u.len() * dim, "gradient", format!("{} x {dim} values", u.len()), gradient.len())?;
     knots[0].check("u", u)?;
     knots[1].check("v", v)?;
     let (p, q) = (knots[0].degree(), knots[1].degree());
@@ -205,19 +191,15 @@ pub fn knot_gradient(
         }
         out
     };
-    let parts = u.par_chunks(size).zip(v.par_chunks(size)).zip(gradient.par_chunks((size * dim).max(1))).map(part).collect();
+    let parts =
+        u.par_chunks(size).zip(v.par_chunks(size)).zip(gradient.par_chunks((size * dim).max(1))).map(part).collect();
     Ok(added(parts, lens[0] + lens[1]))
 }
 
 /// Gradients with respect to the knots of Σ gradient · C(u).
 pub fn curve_knot_gradient(net: &Net, knots: &Knots, u: &[f64], gradient: &[f64]) -> Result<Vec<f64>> {
     let dim = net.dim;
-    require(
-        gradient.len() == u.len() * dim,
-        "gradient",
-        format!("{} x {dim} values", u.len()),
-        gradient.len(),
-    )?;
+    require(gradient.len() == u.len() * dim, "gradient", format!("{} x {dim} values", u.len()), gradient.len())?;
     knots.check("u", u)?;
     let p = knots.degree();
     let len = knots.count() + p + 1;

@@ -66,13 +66,9 @@ impl Knots {
             repeated.map_or(0.0, |t| t[0]),
         )?;
         let domain = (values[degree], values[count]);
-        require(
-            domain.0 < domain.1,
-            argument,
-            "a domain of some length",
-            format!("{:?} to {:?}", domain.0, domain.1),
-        )?;
-        let mut knots = Self { degree, count, values: values.to_vec(), cells: Vec::new(), scale: 0.0, table: Vec::new() };
+        require(domain.0 < domain.1, argument, "a domain of some length", format!("{:?} to {:?}", domain.0, domain.1))?;
+        let mut knots =
+            Self { degree, count, values: values.to_vec(), cells: Vec::new(), scale: 0.0, table: Vec::new() };
         knots.index();
         if degree <= TABLED {
             knots.table = (0..count).map(|span| knots.polynomials(span)).collect();
@@ -304,7 +300,8 @@ mod tests {
                     t.extend(std::iter::repeat_n(next, times.min(p)));
                 }
                 let end = t[t.len() - 1] + 0.5;
-                let mut all: Vec<f64> = (0..p).map(|i| if clamped { 0.0 } else { (i as f64 - p as f64) * 0.3 }).collect();
+                let mut all: Vec<f64> =
+                    (0..p).map(|i| if clamped { 0.0 } else { (i as f64 - p as f64) * 0.3 }).collect();
                 all.extend(&t);
                 all.extend((0..=p).map(|i| if clamped { end } else { end + i as f64 * 0.2 }));
                 let count = all.len() - p - 1;

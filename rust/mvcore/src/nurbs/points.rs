@@ -86,7 +86,15 @@ pub fn surface_points(
 
 /// Copies the wanted entries of a point's derivative table to place `n` of their rows.
 #[inline(always)]
-fn store(table: &[f64], order: usize, width: usize, dim: usize, wanted: &[Derivative], part: &mut [&mut [f64]], n: usize) {
+fn store(
+    table: &[f64],
+    order: usize,
+    width: usize,
+    dim: usize,
+    wanted: &[Derivative],
+    part: &mut [&mut [f64]],
+    n: usize,
+) {
     for (d, row) in wanted.iter().zip(part) {
         let from = (d.u * (order + 1) + d.v) * width;
         row[n * dim..(n + 1) * dim].copy_from_slice(&table[from..from + dim]);
@@ -246,7 +254,10 @@ pub fn curve_points(net: &Net, knots: &Knots, u: &[f64], order: usize) -> Result
     let wanted: Vec<Derivative> = (0..=order).map(|k| Derivative { u: k, v: 0, slot: k }).collect();
     let c = binomials(order);
     let parts = split(&mut out, &wanted, u.len() * dim, CHUNK * dim);
-    parts.into_par_iter().zip(u.par_chunks(CHUNK)).for_each(|(mut part, u)| curve_chunk(net, knots, u, order, &mut part, &c));
+    parts
+        .into_par_iter()
+        .zip(u.par_chunks(CHUNK))
+        .for_each(|(mut part, u)| curve_chunk(net, knots, u, order, &mut part, &c));
     Ok(out)
 }
 
