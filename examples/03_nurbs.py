@@ -46,7 +46,7 @@ def main(output="nurbs.png", mesh_path=None):
     size = float(np.linalg.norm(mesh.extents))
     fit = nurbs.fit_target(mesh, tolerance=0.01 * size, max_control_points=4000)
     print(
-        f"{fit.control_points} control points, {len(mesh.vertices)} vertices; off by {fit.rms_deviation:.2g} rms, {fit.max_deviation:.2g} max"
+        f"{fit.control_points} control points, {len(mesh.vertices)} vertices, off by {fit.rms_deviation:.2g} rms, {fit.max_deviation:.2g}"
     )
     print("within the tolerance" if fit.converged else f"tolerance not reached; {fit.ignored:.0%} of the sections lie in other loops")
     folder = Path(output).parent

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from .. import _core
+
 
 def scaled_maps(maps: Tensor, factor: int) -> Tensor:
     """Relative maps (…, 12) between views for images reduced by ``factor``, whose pixels cover factor² of the full ones."""
@@ -45,6 +47,23 @@ def unit(features: Tensor, groups: int) -> Tensor:
     """Each group of channels scaled to unit length."""
     grouped = features.float().contiguous().unflatten(1, (groups, -1))
     return (grouped * torch.rsqrt(grouped.square().sum(2, keepdim=True) + 1e-6)).flatten(1, 2)
+
+
+def cost_space(
+    reference: Tensor, sources: list[Tensor], maps: list[Tensor], planes: Tensor, groups: int, gain: Tensor, bias: Tensor
+) -> Tensor:
+    """`correlate`, by the Rust kernel where nothing asks for gradients and the tensors are on the CPU; channels last in memory."""
+    if torch.is_grad_enabled() or reference.device.type != "cpu":
+        return correlate(reference, sources, maps, planes, groups, gain, bias)
+    views = [f.float().permute(0, 2, 3, 1).contiguous().numpy() for f in (reference, *sources)]
+    ways = torch.stack([m.float() for m in maps], 1).numpy()
+    swept = planes.float().contiguous().numpy()
+    weights = gain.detach().float().numpy()
+    volumes = [
+        torch.from_numpy(_core.correlate(views[0][b], [v[b] for v in views[1:]], ways[b], swept[b], weights, float(bias)))
+        for b in range(len(swept))
+    ]
+    return torch.stack(volumes).permute(0, 4, 1, 2, 3)
 
 
 def correlate(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from .cost import correlate, scaled_maps, unit
+from .cost import cost_space, scaled_maps, unit
 from .features import PRESETS, Features, normalised
 from .regularise import ConvexUpsample, Regulariser, soft_argmin, windowed_soft_argmin
 
@@ -81,7 +81,7 @@ class DisparityNet(nn.Module):
         b, _c, h, w = quarter[0].shape
         swept = (low[:, None] + step[:, None] * number)[..., None, None].expand(b, planes, h, w)
         f = [unit(q, self.groups) for q in quarter]
-        costs = correlate(f[0], f[1:], [scaled_maps(m, 4) for m in maps], swept, self.groups, self.gain, self.bias)
+        costs = cost_space(f[0], f[1:], [scaled_maps(m, 4) for m in maps], swept, self.groups, self.gain, self.bias)
         coarse_scores = self.coarse(costs, context[0])
         coarse, confidence = self._expected(coarse_scores[-1])
         begun = self.up4(torch.stack([coarse, confidence], 1), context[0])
@@ -91,7 +91,7 @@ class DisparityNet(nn.Module):
         narrow = inverse[:, None] + (offset * step[:, None])[..., None, None]
         g = [unit(x, FINE_GROUPS) for x in half]
         one = torch.ones(FINE_GROUPS, device=low.device) * (4.0 / FINE_GROUPS)
-        costs = correlate(g[0], g[1:], [scaled_maps(m, 2) for m in maps], narrow, FINE_GROUPS, one, self.bias)
+        costs = cost_space(g[0], g[1:], [scaled_maps(m, 2) for m in maps], narrow, FINE_GROUPS, one, self.bias)
         fine_scores = self.fine(costs, detail[0])
         fine = soft_argmin(fine_scores[-1])
         moved = start[:, 0] + (fine - (FINE_PLANES - 1) / 2) * FINE_RATIO

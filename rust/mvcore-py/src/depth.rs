@@ -2,8 +2,12 @@
 
 use crate::convert::{array, map_of, raster, rasters, run, slice, sources};
 use mvcore::aggregate::Penalties;
+use mvcore::correlate::{Features, Planes, Visibility};
 use mvcore::slanted::{Hypothesis, RefineParams, SourceSurface};
-use numpy::{PyArray2, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use numpy::{
+    PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
 
 #[pyfunction]
@@ -37,6 +41,35 @@ pub fn aggregate<'py>(
     let winners = run(py, || mvcore::aggregate::aggregate(values, planes, guide, penalties))?;
     let shape = [guide.height, guide.width];
     Ok((array(py, winners.plane, shape)?, array(py, winners.margin, shape)?))
+}
+
+/// (D, h, w, G) correlations; planes (D,) or (D, h, w).
+#[pyfunction]
+pub fn correlate<'py>(
+    py: Python<'py>,
+    reference: PyReadonlyArray3<'py, f32>,
+    sources: Vec<PyReadonlyArray3<'py, f32>>,
+    maps: PyReadonlyArray2<'py, f32>,
+    planes: PyReadonlyArrayDyn<'py, f32>,
+    gain: PyReadonlyArray1<'py, f32>,
+    bias: f32,
+) -> PyResult<Bound<'py, PyArray4<f32>>> {
+    let of = |a: &PyReadonlyArray3<'py, f32>| (a.shape()[0], a.shape()[1], a.shape()[2]);
+    let (height, width, channels) = of(&reference);
+    let first = Features { data: slice(&reference, "reference")?, width, height, channels };
+    let maps = map_of(&maps, sources.len(), "maps")?;
+    let views: Vec<_> = (sources.iter().zip(maps))
+        .map(|(a, map)| {
+            let (height, width, channels) = of(a);
+            Ok((Features { data: slice(a, "sources")?, width, height, channels }, map))
+        })
+        .collect::<PyResult<_>>()?;
+    let values = slice(&planes, "planes")?;
+    let count = planes.shape().first().copied().unwrap_or(0);
+    let swept = if planes.shape().len() == 1 { Planes::Common(values) } else { Planes::Own(values, count) };
+    let gain = slice(&gain, "gain")?;
+    let out = run(py, || mvcore::correlate::correlate(first, &views, swept, Visibility { gain, bias }))?;
+    array(py, out, (count, height, width, gain.len()))
 }
 
 #[pyfunction]

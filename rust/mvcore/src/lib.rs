@@ -7,6 +7,7 @@
 pub mod aggregate;
 pub mod atlas;
 pub mod consistency;
+pub mod correlate;
 pub mod cube;
 pub mod error;
 pub mod files;
