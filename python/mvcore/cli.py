@@ -64,6 +64,10 @@ def _without(scene: Scene, excluded: list[int] | None) -> tuple[list[Any], list[
     return [scene.frames[n] for n in kept], [scene.calib[n] for n in kept], kept
 
 
+Matcher = Annotated[str, typer.Option(help="Depth matcher: sgm (classical) or dcnn (the network).")]
+Device = Annotated[str, typer.Option(help="Where the network runs: cpu or cuda.")]
+
+
 @app.command()
 def reconstruct(
     path: Annotated[Path, typer.Argument(help="A folder or calibration file; the format is found by itself.")],
@@ -75,7 +79,8 @@ def reconstruct(
     max_faces: Annotated[int | None, typer.Option(help="Decimate the mesh to this many faces.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write figures and warnings as JSON.")] = None,
     save_depth: Annotated[Path | None, typer.Option(help="Folder for the depth maps.")] = None,
-    matcher: Annotated[str, typer.Option(help="Depth matcher: sgm.")] = "sgm",
+    matcher: Matcher = "sgm",
+    device: Device = "cpu",
     debug: Debug = False,
 ) -> None:
     """Calibrated photographs in, a textured mesh out."""
@@ -92,7 +97,7 @@ def reconstruct(
         scene = load(path)
         frames, cameras, kept = _without(scene, _numbers("--exclude", exclude, kind=int))
         box = _numbers("--bounds", bounds, 6)
-        settings: dict[str, Any] = {"matcher": matcher}
+        settings: dict[str, Any] = {"matcher": matcher, "device": device}
         if max_image_size is not None:
             settings["depth"] = {"max_image_size": max_image_size}
         if max_faces is not None:
@@ -123,6 +128,8 @@ def disparity(
     output: Annotated[Path, typer.Option("-o", "--output", help="Disparity map to write: .pfm, or .png (a picture).")],
     max_disparity: Annotated[int, typer.Option(help="Largest disparity in pixels.")],
     min_disparity: Annotated[int, typer.Option(help="Smallest disparity in pixels.")] = 0,
+    matcher: Matcher = "sgm",
+    device: Device = "cpu",
     debug: Debug = False,
 ) -> None:
     """Disparity of the left image of a rectified pair."""
@@ -135,7 +142,8 @@ def disparity(
 
         if output.suffix not in (".pfm", ".png"):
             raise ValueError(f"--output: expected a name ending in .pfm or .png, got {str(output)!r}")
-        found, _ = match(read_image(left), read_image(right), max_disparity=max_disparity, min_disparity=min_disparity)
+        ends = {"max_disparity": max_disparity, "min_disparity": min_disparity}
+        found, _ = match(read_image(left), read_image(right), **ends, matcher=matcher, device=device)
         if output.suffix == ".pfm":
             write_pfm(output, found)
         else:
@@ -267,16 +275,51 @@ def train_disparity_network(
     preset: Annotated[str, typer.Option(help="compact or paper.")] = "compact",
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     hours: Annotated[float | None, typer.Option(help="Stop after this long, with a checkpoint.")] = None,
+    data: Annotated[
+        list[str] | None, typer.Option(help="A published set, LAYOUT:FOLDER (dtu, blendedmvs, sceneflow, kitti, middlebury).")
+    ] = None,
+    middlebury: Annotated[Path | None, typer.Option(help="Folder of Middlebury pairs to validate on as well.")] = None,
     debug: Debug = False,
 ) -> None:
-    """Train the disparity network on procedural scenes."""
+    """Train the disparity network on procedural scenes, and on published sets where given."""
     with _one_line_errors(debug):
+        from .network.batches import Recipe
+        from .network.datasets import find_items
         from .network.features import PRESETS
+        from .network.logs import plot_log
         from .network.train_disparity import Training, train_disparity
 
         if preset not in PRESETS:
             raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
-        print(train_disparity(Training(steps=steps, preset=preset, hours=hours), out, device))
+        for source in data or ():
+            print(f"{source}: {len(find_items(source))} samples")
+        recipe = Recipe(data=tuple(data or ()))
+        pairs = str(middlebury) if middlebury else None
+        print(train_disparity(Training(steps=steps, preset=preset, hours=hours, recipe=recipe, middlebury=pairs), out, device))
+        plot_log(out / "log.csv", out / "log.png")
+
+
+@train.command("recognition")
+def train_recognition_head(
+    out: Annotated[Path, typer.Option(help="Folder of checkpoint, log and weights; an earlier run there goes on.")],
+    steps: Annotated[int, typer.Option(min=1, help="Batches in all.")] = 3000,
+    preset: Annotated[str, typer.Option(help="compact or paper.")] = "compact",
+    error: Annotated[str, typer.Option(help="entropy, or squared (the paper's eq 34).")] = "entropy",
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    debug: Debug = False,
+) -> None:
+    """Train the recognition head on procedural targets seen from several angles."""
+    with _one_line_errors(debug):
+        from .network.features import PRESETS
+        from .network.logs import plot_log
+        from .network.train_recognition import RecognitionTraining, train_recognition
+
+        if preset not in PRESETS:
+            raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
+        if error not in ("entropy", "squared"):
+            raise ValueError(f"--error: expected entropy or squared, got {error!r}")
+        print(train_recognition(RecognitionTraining(steps=steps, preset=preset, error=error), out, device))
+        plot_log(out / "log.csv", out / "log.png")
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """Depth maps: plane sweep, semi-global aggregation, slanted refinement, and consistency across views.
 
-The classical matcher. Coarse to fine: the sweep and the aggregation run on a small image, where they see the most context;
+Two matchers find a view's rough depth, ``sgm`` and the network ``dcnn``; the second pass polishes either. The classical one goes
+coarse to fine: the sweep and the aggregation run on a small image, where they see the most context;
 planes are then refined on it and on each finer scale up to the full size. A rectified pair is the same code with horizontal
 homographies.
 """
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from . import _core
 from .cameras import Camera, relative_map
-from .config import DepthConfig
+from .config import MATCHERS, DepthConfig
 from .errors import require
 from .types import DepthMap
 
@@ -26,10 +27,11 @@ Map = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class View:
-    """An undistorted grey image, (h, w) uint8, with its camera."""
+    """An undistorted grey image, (h, w) uint8, with its camera; the network wants the colours, (h, w, 3) uint8, as well."""
 
     grey: Grey
     camera: Camera
+    colour: NDArray[np.uint8] | None = None
 
     def at(self, width: int, height: int) -> View:
         """The view reduced to another size."""
@@ -205,6 +207,53 @@ def sweep_depth(reference: View, sources: Sequence[View], near: float, far: floa
     return RoughDepth(found)
 
 
+NETWORK_SIDE = 768
+"""Pixels of the longer side at which the network runs: what it finds there the second pass carries to full size."""
+
+
+def network_depth(
+    reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None, device: str = "cpu"
+) -> RoughDepth:
+    """First pass by the network. Parameters and errors as of `sweep_depth`; views need colours; ``device`` is ``cpu`` or ``cuda``."""
+    from .network.match import PLANES, shipped_matcher
+
+    config = config or DepthConfig()
+    _check(sources, near, far)
+    share = min(1.0, NETWORK_SIDE / max(reference.grey.shape))
+    images, cameras = zip(*(_coloured(v, n, share) for n, v in enumerate([reference, *sources[:NETWORK_SOURCES]])), strict=True)
+    inverse, confidence = shipped_matcher(device).depth(images[0], cameras[0], images[1:], cameras[1:], near, far)
+    h, w = reference.grey.shape
+    sizes = _scales(w, h, config.coarsest)
+    w, h = sizes[-2] if len(sizes) > 1 else sizes[-1]
+    inverse = cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
+    a, b = _slopes(inverse)
+    planes = np.stack([inverse, a, b, np.zeros_like(a)], -1)
+    # The second pass searches about a pixel of parallax: what the network's own last stage resolves.
+    step = (1 / near - 1 / far) / (PLANES - 1) * NETWORK_STEP
+    margin = cv2.resize(confidence, (w, h), interpolation=cv2.INTER_LINEAR) / 4
+    return RoughDepth(_Hypotheses(planes, inverse, margin, (1 / far, 1 / near), step))
+
+
+NETWORK_SOURCES = 4
+"""Source views that the network looks at."""
+NETWORK_STEP = 0.25
+"""Interval of its last stage in planes of its first."""
+
+
+def _coloured(view: View, number: int, share: float) -> tuple[NDArray[np.uint8], Camera]:
+    """Colours and camera of a view, reduced."""
+    require(view.colour is not None, "views", "colours for the network", f"view {number} without")
+    assert view.colour is not None
+    w, h = (max(MULTIPLE, round(n * share)) for n in (view.camera.width, view.camera.height))
+    if (h, w) == view.colour.shape[:2]:
+        return view.colour, view.camera
+    return cv2.resize(view.colour, (w, h), interpolation=cv2.INTER_AREA), view.camera.resized(w, h)
+
+
+MULTIPLE = 16
+"""Fewest pixels of a side that the network takes."""
+
+
 def refine_depth(
     reference: View,
     sources: Sequence[View],
@@ -278,6 +327,8 @@ def disparity(
     min_disparity: int = 0,
     config: DepthConfig | None = None,
     fill: bool = True,
+    matcher: str = "sgm",
+    device: str = "cpu",
 ) -> tuple[Map, Map]:
     """Disparity of the left image of a rectified pair.
 
@@ -286,6 +337,8 @@ def disparity(
     left, right : (h, w) or (h, w, 3) uint8, the same size.
     max_disparity, min_disparity : pixels; a point at column x of the left image stands at x - d of the right one.
     fill : replace what the right image does not confirm by the surrounding background; otherwise it is 0.
+    matcher : ``sgm``, or ``dcnn`` for the network, which fills what is hidden itself.
+    device : ``cpu`` or ``cuda``, of the network.
 
     Returns
     -------
@@ -304,6 +357,9 @@ def disparity(
     images = [_grey("left", left), _grey("right", right)]
     require(images[0].shape == images[1].shape, "right", f"the size of left {images[0].shape}", images[1].shape)
     require(max_disparity > min_disparity, "max_disparity", f"more than min_disparity ({min_disparity})", max_disparity)
+    require(matcher in MATCHERS, "matcher", f"one of {', '.join(MATCHERS)}", repr(matcher))
+    if matcher == "dcnn":
+        return _network_disparity(left, right, max_disparity, min_disparity, fill, device)
     mine = _rectified(images[0], images[1], min_disparity, max_disparity, config)
     flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
@@ -318,6 +374,21 @@ def disparity(
     if not fill:
         return np.where(seen, d, 0).astype(np.float32), confidence
     return _fill_occlusions(d, seen, images[0]), confidence
+
+
+def _network_disparity(left: Grey, right: Grey, high: int, low: int, fill: bool, device: str) -> tuple[Map, Map]:
+    from .network.match import shipped_matcher
+
+    views = [np.repeat(i[..., None], 3, 2) if i.ndim == 2 else i for i in (left, right)]
+    network = shipped_matcher(device)
+    d, confidence = network.disparity(views[0], views[1], high, low)
+    if fill:
+        return d, confidence
+    other = network.disparity(views[1][:, ::-1], views[0][:, ::-1], high, low)[0][:, ::-1]
+    x = np.arange(d.shape[1])[None] - d
+    near = np.clip(np.rint(x).astype(int), 0, d.shape[1] - 1)
+    seen = (np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5)
+    return np.where(seen, d, 0).astype(np.float32), np.where(seen, confidence, 0.01).astype(np.float32)
 
 
 def _grey(name: str, image: NDArray[np.uint8]) -> Grey:

@@ -192,15 +192,19 @@ def _depths(
     config: Config,
     track: Track,
 ) -> list[DepthMap | None]:
-    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c) for i, c in zip(images, cameras, strict=True)]
+    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
     used = [n for n, s in enumerate(sources) if s]
     rough: dict[int, depth_stage.RoughDepth] = {}
     for n in track(used, "depth, first pass", len(used)):
-        rough[n] = depth_stage.sweep_depth(views[n], [views[j] for j in sources[n]], *ranges[n], config.depth)
+        others = [views[j] for j in sources[n]]
+        if config.matcher == "dcnn":
+            rough[n] = depth_stage.network_depth(views[n], others, *ranges[n], config.depth, config.device)
+        else:
+            rough[n] = depth_stage.sweep_depth(views[n], others, *ranges[n], config.depth)
     depths: list[DepthMap | None] = [None] * len(views)
     for n in track(used, "depth, second pass", len(used)):
-        others = [j for j in sources[n] if j in rough]
-        depths[n] = depth_stage.refine_depth(views[n], [views[j] for j in others], rough[n], [rough[j] for j in others], config.depth)
+        near = [j for j in sources[n] if j in rough]
+        depths[n] = depth_stage.refine_depth(views[n], [views[j] for j in near], rough[n], [rough[j] for j in near], config.depth)
     return depths
 
 

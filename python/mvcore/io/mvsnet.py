@@ -6,6 +6,7 @@ Its authors do not say where pixel centres are; mvcore takes them at integers.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,13 @@ def read(folder: Path) -> Found:
 
 
 def _view(folder: Path, path: Path) -> Record:
+    record = read_camera(path)
+    stem = path.name.removesuffix("_cam.txt")
+    return replace(record, image=_image(folder, stem) or folder / "images" / f"{stem}.jpg", name=stem)
+
+
+def read_camera(path: Path) -> Record:
+    """One ``*_cam.txt``, without its image."""
     lines = Lines(path)
     words = [n for n, line in enumerate(lines.lines, 1) if line.strip()]
     if len(words) < 10 or lines.lines[words[0] - 1].strip() != "extrinsic":
@@ -50,9 +58,7 @@ def _view(folder: Path, path: Path) -> Record:
     matrix = np.array([lines.numbers(n, 3) for n in words[6:9]])
     if len(lines.numbers(words[9])) not in (2, 3, 4):
         raise lines.fail(words[9], "expected 'DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM DEPTH_MAX]'")
-    stem = path.name.removesuffix("_cam.txt")
-    image = _image(folder, stem)
-    return Record(K=matrix, R=pose[:3, :3], t=pose[:3, 3], image=image or folder / "images" / f"{stem}.jpg", name=stem, line=words[0])
+    return Record(K=matrix, R=pose[:3, :3], t=pose[:3, 3], name=path.stem, line=words[0])
 
 
 def _image(folder: Path, stem: str) -> Path | None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..cameras import relative_map
+from .datasets import Item, cropped, find_items
 from .scenes import Sample, Tiles, random_pair, random_views
 
 RENEWED = 200
@@ -33,7 +34,8 @@ class Batch:
 class Recipe:
     """What the batches are made of.
 
-    sizes in pixels, a multiple of 16; ``pairs`` is the share of batches of rectified pairs.
+    sizes in pixels, a multiple of 16; ``pairs`` is the share of batches of rectified pairs. ``data`` names published sets on disk,
+    ``LAYOUT:FOLDER`` each (`datasets`), from which the share ``files`` of the batches is drawn.
     """
 
     seed: int = 1
@@ -42,6 +44,13 @@ class Recipe:
     height: int = 192
     pairs: float = 0.5
     held_out: bool = False
+    data: tuple[str, ...] = ()
+    files: float = 0.5
+
+
+@lru_cache(maxsize=4)
+def _items(source: str) -> list[Item]:
+    return find_items(source)
 
 
 @lru_cache(maxsize=2)
@@ -52,6 +61,11 @@ def _tiles(seed: int, epoch: int, held_out: bool) -> Tiles:
 def make_batch(recipe: Recipe, number: int) -> Batch:
     """Batch ``number`` of a recipe."""
     random = np.random.default_rng((recipe.seed, 3, number))
+    planes = (24, 32, 40)
+    if recipe.data and random.random() < recipe.files:
+        items = _items(recipe.data[random.integers(len(recipe.data))])
+        picked = [items[k]() for k in random.integers(0, len(items), recipe.batch)]
+        return stack([cropped(s, recipe.width, recipe.height, random) for s in picked], int(random.choice(planes)))
     tiles = _tiles(recipe.seed, number // RENEWED, recipe.held_out)
     size = {"width": recipe.width, "height": recipe.height}
     if random.random() < recipe.pairs:
@@ -59,7 +73,7 @@ def make_batch(recipe: Recipe, number: int) -> Batch:
     else:
         views = int(random.choice([2, 3, 4], p=[0.2, 0.5, 0.3]))
         samples = [random_views(random, tiles, views, **size) for _ in range(recipe.batch)]
-    return stack(samples, int(random.choice([24, 32, 40])))
+    return stack(samples, int(random.choice(planes)))
 
 
 def stack(samples: list[Sample], planes: int) -> Batch:

@@ -17,7 +17,7 @@ from .model import DisparityNet
 def save_weights(net: nn.Module, path: Path, notes: dict[str, str] | None = None) -> None:
     """All weights and buffers in half precision where that is lossless enough (float16), with what built the network."""
     tensors = {k: v.detach().cpu().half().contiguous() if v.dtype.is_floating_point else v.cpu() for k, v in net.state_dict().items()}
-    build = {k: str(getattr(net, k)) for k in ("preset", "groups") if hasattr(net, k)}
+    build = {k: str(getattr(net, k)) for k in ("preset", "groups", "classes") if hasattr(net, k)}
     hourglasses = getattr(getattr(net, "coarse", None), "hourglasses", None)
     if hourglasses is not None:
         build["hourglasses"] = str(len(hourglasses))
@@ -26,8 +26,8 @@ def save_weights(net: nn.Module, path: Path, notes: dict[str, str] | None = None
     os.replace(temporary, path)
 
 
-def load_disparity(path: Path) -> DisparityNet:
-    """The network that a weights file was saved from, ready for inference."""
+def notes_of(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    """What built the network, and its tensors."""
     try:
         with safe_open(path, "pt") as file:
             notes = file.metadata() or {}
@@ -36,9 +36,20 @@ def load_disparity(path: Path) -> DisparityNet:
         raise
     except Exception as error:
         raise FormatError(f"{path}: not a safetensors file: {error}") from None
-    net = DisparityNet(notes.get("preset", "compact"), int(notes.get("hourglasses", 3)), int(notes.get("groups", 8)))
+    return notes, state
+
+
+def load_into(net: nn.Module, state: dict[str, torch.Tensor], path: Path) -> None:
+    """Takes the tensors, which must be the network's own."""
     try:
         net.load_state_dict({k: v.float() if v.dtype == torch.float16 else v for k, v in state.items()})
     except RuntimeError as error:
         raise FormatError(f"{path}: weights of another network: {str(error).splitlines()[-1].strip()}") from None
+
+
+def load_disparity(path: Path) -> DisparityNet:
+    """The network that a weights file was saved from, ready for inference."""
+    notes, state = notes_of(path)
+    net = DisparityNet(notes.get("preset", "compact"), int(notes.get("hourglasses", 3)), int(notes.get("groups", 8)))
+    load_into(net, state, path)
     return net.eval()
