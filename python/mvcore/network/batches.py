@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,8 @@ class Recipe:
     """What the batches are made of.
 
     sizes in pixels, a multiple of 16; ``pairs`` is the share of batches of rectified pairs. ``data`` names published sets on disk,
-    ``LAYOUT:FOLDER`` each (`datasets`), from which the share ``files`` of the batches is drawn.
+    ``LAYOUT:FOLDER`` each (`datasets`), from which the share ``files`` of the batches is drawn. ``floating`` and ``wide`` as of
+    `random_pair`: what the ablations leave out.
     """
 
     seed: int = 1
@@ -44,6 +46,8 @@ class Recipe:
     height: int = 192
     pairs: float = 0.5
     held_out: bool = False
+    floating: bool = True
+    wide: bool = True
     data: tuple[str, ...] = ()
     files: float = 0.5
 
@@ -67,7 +71,7 @@ def make_batch(recipe: Recipe, number: int) -> Batch:
         picked = [items[k]() for k in random.integers(0, len(items), recipe.batch)]
         return stack([cropped(s, recipe.width, recipe.height, random) for s in picked], int(random.choice(planes)))
     tiles = _tiles(recipe.seed, number // RENEWED, recipe.held_out)
-    size = {"width": recipe.width, "height": recipe.height}
+    size: dict[str, Any] = {"width": recipe.width, "height": recipe.height, "floating": recipe.floating, "wide": recipe.wide}
     if random.random() < recipe.pairs:
         samples = [random_pair(random, tiles, **size) for _ in range(recipe.batch)]
     else:

@@ -67,11 +67,11 @@ def _towards(center: Array, target: Array, roll: float) -> Array:
     return euler_to_rotation(0, 0, roll) @ np.stack([x, np.cross(z, x), z])
 
 
-def _stage(random: Random, focal: float, size: tuple[int, int], near: float, far: float, held_out: bool) -> list[Shape]:
+def _stage(random: Random, focal: float, size: tuple[int, int], near: float, far: float, held_out: bool, floating: bool) -> list[Shape]:
     """Shapes floating in front of a camera at the origin that looks along z, with what stands behind them."""
     half = np.array(size) / (2 * focal)
     shapes = []
-    for _ in range(int(random.integers(6, 24))):
+    for _ in range(int(random.integers(6, 24)) if floating else 0):
         depth = near * (far / near) ** random.beta(1.0, 1.3)
         middle = random.uniform(-1.1, 1.1, 2) * half * depth
         radius = depth * half.max() * np.exp(random.uniform(np.log(0.06), np.log(0.6)))
@@ -131,16 +131,27 @@ def _visible(depth: Array, reference: Camera, other: Array, source: Camera) -> N
     return inside & (np.abs(seen - z) < 0.03 * z)
 
 
-def random_pair(random: Random, tiles: Tiles, width: int = 256, height: int = 192, max_disparity: float | None = None) -> Sample:
+def random_pair(
+    random: Random,
+    tiles: Tiles,
+    width: int = 256,
+    height: int = 192,
+    max_disparity: float | None = None,
+    *,
+    floating: bool = True,
+    wide: bool = True,
+) -> Sample:
     """A rectified pair, left image first. The baseline is 1 over the focal length: inverse depth is disparity in pixels.
 
-    ``max_disparity`` in pixels; by default log-uniform over a decade.
+    ``max_disparity`` in pixels; by default log-uniform over a decade, or unless ``wide`` over half an octave. ``floating``: with shapes
+    between the camera and the walls.
     """
     focal = width * random.uniform(0.8, 2.5)
-    top = max_disparity or float(np.exp(random.uniform(np.log(9), np.log(90))))
+    ends = (9, 90) if wide else (28, 40)
+    top = max_disparity or float(np.exp(random.uniform(np.log(ends[0]), np.log(ends[1]))))
     near = 1.0
     far = near * np.exp(random.uniform(np.log(1.6), np.log(10)))
-    shapes = _stage(random, focal, (width, height), near * 1.15, far, tiles.held_out)
+    shapes = _stage(random, focal, (width, height), near * 1.15, far, tiles.held_out, floating)
     baseline = top * near / focal
     shift = random.normal(0, 0.25, 2) * np.array([width, height]) * 0.3
     error = np.array([0, random.normal(0, 0.2)]) if random.random() < 0.5 else np.zeros(2)
@@ -156,15 +167,17 @@ def random_pair(random: Random, tiles: Tiles, width: int = 256, height: int = 19
     return Sample(photographs, tuple(unit), inverse, seen, (0.0, float(max(inverse.max(), top * 0.7) * random.uniform(1.0, 1.3))))
 
 
-def random_views(random: Random, tiles: Tiles, views: int = 3, width: int = 256, height: int = 192) -> Sample:
-    """Posed views around a scene, neighbours up to 40 degrees apart."""
+def random_views(
+    random: Random, tiles: Tiles, views: int = 3, width: int = 256, height: int = 192, *, floating: bool = True, wide: bool = True
+) -> Sample:
+    """Posed views around a scene, neighbours up to 40 degrees apart, or unless ``wide`` up to 8."""
     focal = width * random.uniform(0.8, 2.2)
     near, far = 2.0, 2.0 * np.exp(random.uniform(np.log(1.4), np.log(4)))
-    shapes = _stage(random, focal, (width, height), near, far, tiles.held_out)
+    shapes = _stage(random, focal, (width, height), near, far, tiles.held_out, floating)
     target = np.array([0, 0, near * (far / near) ** random.uniform(0.2, 0.6)])
     reference = _camera(width, height, focal, np.eye(3), np.zeros(3), random.normal(0, 0.03, 2) * width)
     cameras = [reference]
-    widest = np.exp(random.uniform(np.log(3), np.log(40)))
+    widest = np.exp(random.uniform(np.log(3), np.log(40 if wide else 8)))
     for _ in range(views - 1):
         angle, around = np.radians(widest * random.uniform(0.5, 1.0)), random.normal(0, 0.4) + random.choice([0, np.pi])
         turn = np.array([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), -np.cos(angle)])

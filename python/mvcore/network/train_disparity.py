@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from .batches import Batch, Recipe, make_batch
 from .datasets import Item, find_items
-from .logs import log_row
+from .logs import cut_log, log_row
 from .losses import loss
 from .match import RECTIFIED, padded, planes_for
 from .model import DisparityNet, Prediction
@@ -37,6 +37,7 @@ class Training:
     preset: str = "compact"
     hourglasses: int = 3
     groups: int = 8
+    windowed: bool = True
     rate: float = 1e-3
     warmup: int = 200
     decay: float = 0.4
@@ -112,7 +113,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     out.mkdir(parents=True, exist_ok=True)
     where = torch.device(device)
     torch.manual_seed(training.recipe.seed)
-    net = DisparityNet(training.preset, training.hourglasses, training.groups).to(where).train()
+    net = DisparityNet(training.preset, training.hourglasses, training.groups, training.windowed).to(where).train()
     average = _Average(net, training.averaging)
     optimiser = torch.optim.AdamW(net.parameters(), training.rate, weight_decay=1e-4)
     pairs = find_items(f"middlebury:{training.middlebury}") if training.middlebury else []

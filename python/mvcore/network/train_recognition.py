@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from dataclasses import dataclass
@@ -80,7 +81,8 @@ def train_recognition(
     started, total, seen = time.perf_counter(), 0.0, 0
     while step < training.steps:
         for group in optimiser.param_groups:
-            group["lr"] = training.rate * min(1.0, (step + 1) / 100) * 0.5 * (1 + np.cos(np.pi * step / training.steps))
+            falling = 0.5 * (1 + math.cos(math.pi * step / training.steps))
+            group["lr"] = training.rate * min(1.0, (step + 1) / 100) * falling
         images, classes = _drawn(stock, training, step)
         torch.manual_seed(training.seed * 1_000_003 + step)
         net.train()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import torch
@@ -11,19 +10,18 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ..errors import FormatError
+from ..io.write import atomically
 from .model import DisparityNet
 
 
 def save_weights(net: nn.Module, path: Path, notes: dict[str, str] | None = None) -> None:
     """All weights and buffers in half precision where that is lossless enough (float16), with what built the network."""
     tensors = {k: v.detach().cpu().half().contiguous() if v.dtype.is_floating_point else v.cpu() for k, v in net.state_dict().items()}
-    build = {k: str(getattr(net, k)) for k in ("preset", "groups", "classes") if hasattr(net, k)}
+    build = {k: str(getattr(net, k)) for k in ("preset", "groups", "windowed", "classes") if hasattr(net, k)}
     hourglasses = getattr(getattr(net, "coarse", None), "hourglasses", None)
     if hourglasses is not None:
         build["hourglasses"] = str(len(hourglasses))
-    temporary = path.with_name(path.name + ".tmp")
-    save_file(tensors, temporary, build | (notes or {}))
-    os.replace(temporary, path)
+    atomically(path, lambda p: save_file(tensors, p, build | (notes or {})))
 
 
 def notes_of(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
@@ -50,6 +48,7 @@ def load_into(net: nn.Module, state: dict[str, torch.Tensor], path: Path) -> Non
 def load_disparity(path: Path) -> DisparityNet:
     """The network that a weights file was saved from, ready for inference."""
     notes, state = notes_of(path)
-    net = DisparityNet(notes.get("preset", "compact"), int(notes.get("hourglasses", 3)), int(notes.get("groups", 8)))
+    windowed = notes.get("windowed", "True") == "True"
+    net = DisparityNet(notes.get("preset", "compact"), int(notes.get("hourglasses", 3)), int(notes.get("groups", 8)), windowed)
     load_into(net, state, path)
     return net.eval()

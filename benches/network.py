@@ -1,0 +1,209 @@
+"""The network's figures, one command each, beside the classical matcher and OpenCV's MODE_HH on the same run.
+
+    python benches/network.py size                       parameters, GMAC, CPU seconds and memory of a view
+    python benches/network.py heldout                    pairs and views of families that training never saw
+    python benches/network.py stereo FOLDER              Middlebury's cone, teddy, Cloth3, adirondack
+    python benches/network.py synthetic FOLDER           rectified pairs with exact truth (pairs.json)
+    python benches/network.py views FOLDER...            scenes with exact depth (cameras.json, depth/, masks/)
+    python benches/network.py confidence PICTURE.png     precision against coverage on held-out pairs and views
+    python benches/network.py ablation [STEPS]           short trainings of equal length, one difference each
+
+``--weights FILE`` measures other weights than the package's.
+"""
+
+import argparse
+import json
+import resource
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import mvcore
+import numpy as np
+import torch
+from mvcore import metrics, sparse
+from mvcore.config import Config
+from mvcore.io.images import load_frame
+from mvcore.network.batches import Recipe, make_batch
+from mvcore.network.match import SHIPPED, Matcher, planes_for
+from mvcore.network.train_disparity import Training, train_disparity, validate
+from mvcore.network.weights import load_disparity
+from peers import PAIRS
+
+
+def size(arguments):
+    from torch.utils.flop_counter import FlopCounterMode
+
+    net = load_disparity(arguments.weights)
+    print(f"parameters {sum(p.numel() for p in net.parameters()) / 1e6:.2f} M, file {arguments.weights.stat().st_size / 1e6:.2f} MB")
+    pair = [torch.randint(0, 255, (1, 3, 480, 640), dtype=torch.uint8) for _ in range(2)]
+    maps = [torch.tensor([[1, 0, 0, 0, 1, 0, 0, 0, 1, -1, 0, 0]], dtype=torch.float32)]
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        net(pair[0], pair[1:], maps, torch.zeros(1), torch.full((1,), 64.0), planes_for(64))
+    print(f"640 x 480 pair, 64 disparities: {counter.get_total_flops() / 2e9:.1f} GMAC")
+    matcher = Matcher(arguments.weights)
+    random = np.random.default_rng(0)
+    width, height = 1024, 682
+    images = [random.integers(0, 255, (height, width, 3), np.uint8) for _ in range(5)]
+    K = [[900, 0, (width - 1) / 2], [0, 900, (height - 1) / 2], [0, 0, 1]]
+    cameras = [mvcore.Camera(K, np.eye(3), [-0.1 * k, 0, 0], width, height) for k in range(5)]
+    views = [mvcore.depth.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
+    for name, job in (
+        ("network alone, full size", lambda: matcher.depth(images[0], cameras[0], images[1:], cameras[1:], 2, 8)),
+        ("first pass as in the pipeline", lambda: mvcore.depth.network_depth(views[0], views[1:], 2, 8)),
+    ):
+        job()
+        started, cpu = time.perf_counter(), time.process_time()
+        job()
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        wall, cpu = time.perf_counter() - started, time.process_time() - cpu
+        print(f"1024 x 682 with 4 sources, {name}: {cpu:.1f} CPU s, {wall:.1f} s, peak {peak:.0f} MiB")
+
+
+def heldout(arguments):
+    net = load_disparity(arguments.weights)
+    print({k: round(v, 4) for k, v in validate(net, Recipe(), torch.device("cpu"), 40).items()})
+
+
+def _compared(matcher, pairs):
+    rows = []
+    for name, left, right, truth, clear in pairs:
+        most = int(np.ceil((truth[np.isfinite(truth)].max() + 1) / 16) * 16)
+        found = {"network": matcher.disparity(left, right, most)[0], "sgm": mvcore.disparity(left, right, max_disparity=most)[0]}
+        peer = cv2.StereoSGBM_create(0, most, 5, 8 * 75, 32 * 75, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH)
+        found["HH"] = peer.compute(left[..., ::-1].copy(), right[..., ::-1].copy()).astype(np.float32) / 16
+        bad = {k: metrics.disparity_metrics(d, truth)["bad_2"] for k, d in found.items()}
+        if clear is not None:
+            bad |= {f"{k}, not hidden": metrics.disparity_metrics(d, truth, clear)["bad_2"] for k, d in found.items()}
+        rows.append(bad)
+        print(f"  {name:12s}" + "".join(f"  {k} {100 * v:5.1f} %" for k, v in bad.items()), flush=True)
+    print(f"  {'mean':12s}" + "".join(f"  {k} {100 * np.mean([r[k] for r in rows]):5.1f} %" for k in rows[0]))
+
+
+def stereo(arguments):
+    def pairs():
+        for name, left, right, true, scale in PAIRS:
+            a, b = (cv2.imread(str(arguments.folders[0] / name / f))[..., ::-1].copy() for f in (left, right))
+            truth = cv2.imread(str(arguments.folders[0] / name / true), cv2.IMREAD_GRAYSCALE).astype(np.float32) / scale
+            yield name, a, b, truth, None
+
+    print("bad-2.0 over all known pixels, holes counted")
+    _compared(Matcher(arguments.weights), pairs())
+
+
+def synthetic(arguments):
+    def pairs():
+        folder = arguments.folders[0]
+        for pair in json.loads((folder / "pairs.json").read_text())["pairs"]:
+            own = folder / pair["name"]
+            a, b = (cv2.imread(str(own / f))[..., ::-1].copy() for f in ("left.png", "right.png"))
+            truth = next(iter(np.load(own / "disp_left.npz").values())).astype(np.float32)
+            yield pair["name"], a, b, truth, cv2.imread(str(own / "mask_nonocc.png"), cv2.IMREAD_GRAYSCALE)
+
+    print("bad-2.0 over all known pixels, holes counted")
+    _compared(Matcher(arguments.weights), pairs())
+
+
+def _truth(folder, frame, kind):
+    """The file of a view among depth/ or masks/: one a view, or a folder a camera."""
+    path = Path(frame)
+    found = [p for p in sorted((folder / kind).rglob("*.png")) if p.stem == path.stem and p.parent.name in (path.parent.name, kind)]
+    return cv2.imread(str(found[0]), cv2.IMREAD_UNCHANGED)
+
+
+def views(arguments):
+    matcher, config = Matcher(arguments.weights), Config()
+    print("share of the target's pixels within 1 % of the true depth, before any filter, no masks")
+    for folder in arguments.folders:
+        scene = mvcore.load(folder)
+        cameras = [c.pinhole() for c in scene.calib]
+        images = [load_frame(f, c, n) for n, (f, c) in enumerate(zip(scene.frames, scene.calib, strict=True))]
+        points = sparse.find_points(images, cameras)
+        box = sparse.target_box(cameras, points)
+        ranges = sparse.depth_ranges(cameras, points, box, config.sparse.range_stretch, False)
+        sources = sparse.choose_sources(sparse.view_scores(cameras, points, box, config.depth), config.depth.sources)
+        gray = [mvcore.depth.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
+        scale = json.loads((folder / "cameras.json").read_text())["depth_scale"]
+        shares = {"network": [], "network, polished": [], "sgm": []}
+        mvcore.network.match.shipped_matcher.cache_clear()
+        for n in np.unique(np.linspace(0, len(images) - 1, arguments.count).astype(int)):
+            truth = _truth(folder, scene.frames[n], "depth").astype(np.float32) * scale
+            mask = _truth(folder, scene.frames[n], "masks") > 0
+            near = [gray[j] for j in sources[n]]
+            inverse, _ = matcher.depth(images[n], cameras[n], [v.colour for v in near[:4]], [v.camera for v in near[:4]], *ranges[n])
+            rough = mvcore.depth.network_depth(gray[n], near, *ranges[n])
+            found = {
+                "network": 1 / np.maximum(inverse, 1e-9),
+                "network, polished": mvcore.depth.refine_depth(gray[n], near, rough, ()).depth,
+                "sgm": mvcore.depth.estimate_depth(gray[n], near, *ranges[n]).depth,
+            }
+            for name, depth in found.items():
+                shares[name].append(metrics.depth_metrics(depth, truth, mask & (truth > 0))["within_1_percent"])
+        print(f"  {folder.name:14s}" + "".join(f"  {k} {np.mean(v):.3f}" for k, v in shares.items()), flush=True)
+
+
+def confidence(arguments):
+    from matplotlib.figure import Figure
+
+    net = load_disparity(arguments.weights)
+    figure = Figure((5, 4), layout="constrained")
+    axes = figure.add_subplot(xlabel="share of pixels kept, most confident first", ylabel="share of them off by more than a plane")
+    for name, pairs in (("pairs", 1.0), ("views", 0.0)):
+        recipe = Recipe(seed=1_000_001, held_out=True, pairs=pairs)
+        wrong, sure = [], []
+        for n in range(30):
+            batch = replace(make_batch(recipe, n), planes=32)
+            with torch.no_grad():
+                found = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+            known = (batch.inverse > batch.low[:, None, None]) & (batch.inverse <= batch.high[:, None, None])
+            step = ((batch.high - batch.low) / 31)[:, None, None]
+            wrong.append((((found.inverse - batch.inverse).abs() / step) > 1)[known])
+            sure.append(found.confidence[known])
+        bad, order = torch.cat(wrong).double(), torch.cat(sure).argsort(descending=True)
+        kept = torch.arange(1, len(bad) + 1)
+        curve = bad[order].cumsum(0) / kept
+        tenth = int(0.9 * len(bad))
+        removed = 1 - float(bad[order][:tenth].sum() / bad.sum())
+        print(f"{name}: {100 * bad.mean():.1f} % bad; the least confident tenth holds {100 * removed:.0f} % of them")
+        axes.plot(kept[::1000] / len(bad), curve[::1000], label=name)
+    axes.legend()
+    figure.savefig(arguments.folders[0], dpi=100)
+
+
+VARIANTS = {
+    "as shipped": ({}, {}),
+    "one output module": ({"hourglasses": 0}, {}),
+    "plain soft-argmin": ({"windowed": False}, {}),
+    "single correlation": ({"groups": 1}, {}),
+    "no floating shapes": ({}, {"floating": False}),
+    "narrow baselines": ({}, {"wide": False}),
+}
+
+
+def ablation(arguments):
+    steps = int(str(arguments.folders[0])) if arguments.folders else 300
+    print(f"{steps} steps each; on held-out families: shares of pixels off by more than a plane, mean error in px")
+    for name, (build, data) in VARIANTS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            training = Training(steps=steps, every=steps, warmup=20, averaging=0.98, recipe=Recipe(width=160, height=112, **data), **build)
+            train_disparity(training, Path(folder), report=lambda _: None)
+            net = load_disparity(Path(folder) / "best.safetensors")
+        figures = validate(net, Recipe(), torch.device("cpu"), 10)
+        print(f"  {name:20s}" + "".join(f"  {k} {v:.3f}" for k, v in figures.items()), flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    jobs = {f.__name__: f for f in (size, heldout, stereo, synthetic, views, confidence, ablation)}
+    parser.add_argument("job", choices=jobs)
+    parser.add_argument("folders", type=Path, nargs="*")
+    parser.add_argument("--weights", type=Path, default=SHIPPED)
+    parser.add_argument("--count", type=int, default=4, help="views of each scene")
+    arguments = parser.parse_args()
+    jobs[arguments.job](arguments)
+
+
+if __name__ == "__main__":
+    main()
