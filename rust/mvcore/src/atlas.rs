@@ -6,17 +6,20 @@
 //! ```
 //!
 //! A chart keeps the photograph's own pixels, so painting copies without resampling. Seam levelling after Lempitsky and Ivanov,
-//! CVPR 2007; faces that no view sees get small cells of their own, coloured from their neighbours.
+//! CVPR 2007; faces that no view sees take the colours of their neighbours from a palette, a few cells that many of them share.
 
 use crate::error::{Result, require};
 use crate::mesh::{Mesh, NOTHING, components, neighbours, project};
+use crate::pack::pack;
 use crate::raster::Raster;
 use rayon::prelude::*;
 
 /// Pixels around a chart's faces that are copied along, for filtering and mip-maps.
 const PADDING: i64 = 3;
-/// Texels along the side of an unseen face's cell.
+/// Texels along the side of a cell of the palette.
 const CELL: usize = 4;
+/// Grey levels from one colour of the palette to the next.
+const SHADE: f32 = 8.0;
 /// Pull of neighbouring corrections towards each other, relative to a seam's pull.
 const SMOOTHNESS: f64 = 0.1;
 /// Pull of corrections towards zero: fixes the overall brightness.
@@ -69,16 +72,24 @@ pub fn build_atlas(mesh: Mesh, labels: &[i32], sources: &[Source], max_size: usi
     let around = neighbours(mesh.faces);
     let (part, count) = components(&around, |f, g| labels[f] == labels[g]);
     let split = Split::new(mesh, labels, &part, count, sources);
-    let (mut charts, unseen) = split.charts(labels, count);
-    let (width, height, cells) = pack(&mut charts, unseen.len())?;
+    let mut charts = split.charts(count);
+    let colours = split.colours(sources);
+    let corrections = split.level(labels, &colours);
+    let palette = Palette::new(mesh, labels, &split, &colours, &corrections);
+    let sizes: Vec<(usize, usize)> = charts.iter().map(|c| c.map_or((0, 0), |c| c.size)).collect();
+    let (places, width, used) = pack(&sizes, palette.colours.len() * CELL * CELL, CELL);
+    for (chart, to) in charts.iter_mut().zip(places) {
+        if let Some(chart) = chart {
+            chart.to = to;
+        }
+    }
+    let height = (used + palette.colours.len().div_ceil(width / CELL) * CELL).max(1);
     require(
         width <= max_size && height <= max_size,
         "max_size",
         format!("an atlas of at most {max_size} texels a side"),
         format!("{height} x {width}"),
     )?;
-    let colours = split.colours(sources);
-    let corrections = split.level(labels, &colours);
     let mut out = Textured {
         texel: vec![[0.0; 2]; split.origin.len()],
         faces: split.faces.clone(),
@@ -89,7 +100,7 @@ pub fn build_atlas(mesh: Mesh, labels: &[i32], sources: &[Source], max_size: usi
     };
     split.place(&charts, &mut out);
     paint(&charts, &split, &corrections, sources, labels, &part, &mut out);
-    paint_unseen(mesh, &split, &colours, &corrections, &unseen, cells, &mut out);
+    palette.paint(mesh, used, &mut out);
     Ok(out)
 }
 
@@ -97,7 +108,7 @@ pub fn build_atlas(mesh: Mesh, labels: &[i32], sources: &[Source], max_size: usi
 struct Split {
     origin: Vec<u32>,
     faces: Vec<[u32; 3]>,
-    /// View of each new vertex, or [`NOTHING`].
+    /// View of each new vertex.
     view: Vec<i32>,
     /// Chart of each new vertex.
     part: Vec<u32>,
@@ -118,22 +129,17 @@ impl Split {
             pixel: Vec::new(),
         };
         for f in by_part {
-            let p = part[f as usize];
+            let (p, label) = (part[f as usize], labels[f as usize]);
+            // What no view sees is split by colour, later.
+            let Some(source) = sources.get(label as usize) else { continue };
             for (k, &v) in mesh.faces[f as usize].iter().enumerate() {
-                // Unseen faces share nothing: each corner has its own texel.
-                let label = labels[f as usize];
-                if label == NOTHING || last[v as usize].0 != p {
+                if last[v as usize].0 != p {
                     last[v as usize] = (p, out.origin.len() as u32);
                     out.origin.push(v);
                     out.view.push(label);
                     out.part.push(p);
-                    out.pixel.push(match sources.get(label as usize) {
-                        Some(s) => {
-                            let q = project(&s.projection, mesh.vertices[v as usize]);
-                            [q[0], q[1]]
-                        }
-                        None => [0.0; 2],
-                    });
+                    let q = project(&source.projection, mesh.vertices[v as usize]);
+                    out.pixel.push([q[0], q[1]]);
                 }
                 out.faces[f as usize][k] = last[v as usize].1;
             }
@@ -141,7 +147,7 @@ impl Split {
         out
     }
 
-    fn charts(&self, labels: &[i32], count: usize) -> (Vec<Option<Chart>>, Vec<u32>) {
+    fn charts(&self, count: usize) -> Vec<Option<Chart>> {
         let mut bounds = vec![([f64::MAX; 2], [f64::MIN; 2], NOTHING); count];
         for (v, q) in self.pixel.iter().enumerate() {
             let (low, high, view) = &mut bounds[self.part[v] as usize];
@@ -159,8 +165,7 @@ impl Split {
                 Chart { view: view as usize, from: (from[0], from[1]), size: (size[0], size[1]), to: (0, 0) }
             })
         };
-        let unseen = (0..labels.len() as u32).filter(|&f| labels[f as usize] == NOTHING).collect();
-        (bounds.iter().map(chart).collect(), unseen)
+        bounds.iter().map(chart).collect()
     }
 
     fn place(&self, charts: &[Option<Chart>], out: &mut Textured) {
@@ -299,48 +304,6 @@ fn bilinear(rgb: &Raster<u8>, x: f64, y: f64) -> [f64; 3] {
     })
 }
 
-/// Skyline packing, tallest first, into a square-ish atlas; returns its size and the row where the cells begin.
-fn pack(charts: &mut [Option<Chart>], cells: usize) -> Result<(usize, usize, usize)> {
-    let mut order: Vec<usize> = (0..charts.len()).filter(|&c| charts[c].is_some()).collect();
-    let size = |c: usize, charts: &[Option<Chart>]| charts[c].map_or((0, 0), |c| c.size);
-    order.sort_by_key(|&c| (std::cmp::Reverse(size(c, charts).1), std::cmp::Reverse(size(c, charts).0), c));
-    let area: usize = order.iter().map(|&c| size(c, charts).0 * size(c, charts).1).sum();
-    let widest = order.iter().map(|&c| size(c, charts).0).max().unwrap_or(CELL);
-    let width = widest.max(((area + cells * CELL * CELL) as f64).sqrt() as usize + CELL).next_multiple_of(64);
-    // The skyline: (x, height) of each step, x ascending.
-    let mut line = vec![(0usize, 0usize)];
-    for c in order {
-        let (w, h) = size(c, charts);
-        let mut best = (usize::MAX, 0);
-        for i in 0..line.len() {
-            let x = line[i].0;
-            if x + w > width {
-                break;
-            }
-            let top = line[i..].iter().take_while(|s| s.0 < x + w).map(|s| s.1).max().unwrap_or(0);
-            if top < best.0 {
-                best = (top, i);
-            }
-        }
-        let (top, i) = best;
-        let x = line[i].0;
-        let end = line[i..].iter().position(|s| s.0 >= x + w).map_or(line.len(), |n| i + n);
-        let after = line[end - 1].1;
-        let beyond = line.get(end).map_or(width, |s| s.0);
-        let mut steps = vec![(x, top + h)];
-        if x + w < beyond {
-            steps.push((x + w, after));
-        }
-        line.splice(i..end, steps);
-        if let Some(chart) = &mut charts[c] {
-            chart.to = (x, top);
-        }
-    }
-    let used = line.iter().map(|s| s.1).max().unwrap_or(0);
-    let rows = cells.div_ceil(width / CELL) * CELL;
-    Ok((width, (used + rows).max(1), used))
-}
-
 fn paint(
     charts: &[Option<Chart>],
     split: &Split,
@@ -456,38 +419,61 @@ fn spread(shift: &mut [[f32; 3]], w: usize, h: usize) {
     }
 }
 
-fn paint_unseen(
-    mesh: Mesh,
-    split: &Split,
-    colours: &[[f64; 3]],
-    corrections: &[[f64; 3]],
-    unseen: &[u32],
-    first_row: usize,
-    out: &mut Textured,
-) {
-    if unseen.is_empty() {
-        return;
-    }
-    let filled = fill_colours(mesh, split, colours, corrections, unseen);
-    let columns = out.width / CELL;
-    let far = (CELL - 1) as f32;
-    for (n, &f) in unseen.iter().enumerate() {
-        let (x0, y0) = (n % columns * CELL, first_row + n / columns * CELL);
-        let c = mesh.faces[f as usize].map(|v| filled[v as usize]);
-        let corners = [[0.0, 0.0], [far, 0.0], [0.0, far]];
-        for k in 0..3 {
-            out.texel[split.faces[f as usize][k] as usize] = [x0 as f32 + corners[k][0], y0 as f32 + corners[k][1]];
+/// Colours for the faces that no view sees, each shared by all faces of about that colour.
+struct Palette {
+    unseen: Vec<u32>,
+    /// Number of the colour of each unseen face.
+    number: Vec<u32>,
+    /// In steps of [`SHADE`].
+    colours: Vec<[u8; 3]>,
+}
+
+impl Palette {
+    fn new(mesh: Mesh, labels: &[i32], split: &Split, colours: &[[f64; 3]], corrections: &[[f64; 3]]) -> Self {
+        let unseen: Vec<u32> = (0..labels.len() as u32).filter(|&f| labels[f as usize] == NOTHING).collect();
+        if unseen.is_empty() {
+            return Self { unseen, number: Vec::new(), colours: Vec::new() };
         }
-        for y in 0..CELL {
-            for x in 0..CELL {
-                let (mut u, mut v) = (x as f32 / far, y as f32 / far);
-                if u + v > 1.0 {
-                    (u, v) = (u / (u + v), v / (u + v));
+        let filled = fill_colours(mesh, split, colours, corrections, &unseen);
+        let shade = |&f: &u32| -> [u8; 3] {
+            let c = mesh.faces[f as usize].map(|v| filled[v as usize]);
+            std::array::from_fn(|k| (((c[0][k] + c[1][k] + c[2][k]) / (3.0 * SHADE)).clamp(0.0, 255.0 / SHADE)) as u8)
+        };
+        let shades: Vec<[u8; 3]> = unseen.iter().map(shade).collect();
+        let mut distinct = shades.clone();
+        distinct.sort_unstable();
+        distinct.dedup();
+        let number = shades.iter().map(|s| distinct.partition_point(|d| d < s) as u32).collect();
+        Self { unseen, number, colours: distinct }
+    }
+
+    /// Paints the cells from row `first` on and gives the unseen faces their vertices: one for each place and colour.
+    fn paint(&self, mesh: Mesh, first: usize, out: &mut Textured) {
+        let columns = out.width / CELL;
+        let corner = |n: usize| (n % columns * CELL, first + n / columns * CELL);
+        for (n, shade) in self.colours.iter().enumerate() {
+            let (x0, y0) = corner(n);
+            let value = shade.map(|s| ((f32::from(s) + 0.5) * SHADE).min(255.0) as u8);
+            for y in y0..y0 + CELL {
+                for x in x0..x0 + CELL {
+                    out.atlas[(y * out.width + x) * 3..][..3].copy_from_slice(&value);
                 }
-                for k in 0..3 {
-                    let value = c[0][k] + u * (c[1][k] - c[0][k]) + v * (c[2][k] - c[0][k]);
-                    out.atlas[((y0 + y) * out.width + x0 + x) * 3 + k] = (value + 0.5).clamp(0.0, 255.0) as u8;
+            }
+        }
+        let mut order: Vec<usize> = (0..self.unseen.len()).collect();
+        order.sort_by_key(|&i| self.number[i]);
+        let mut last = vec![(u32::MAX, 0u32); mesh.vertices.len()];
+        let middle = (CELL - 1) as f32 / 2.0;
+        for i in order {
+            let (f, n) = (self.unseen[i] as usize, self.number[i]);
+            for (k, &v) in mesh.faces[f].iter().enumerate() {
+                if last[v as usize].0 != n {
+                    last[v as usize] = (n, out.origin.len() as u32);
+                    let (x, y) = corner(n as usize);
+                    out.origin.push(v);
+                    out.texel.push([x as f32 + middle, y as f32 + middle]);
                 }
+                out.faces[f][k] = last[v as usize].1;
             }
         }
     }
@@ -506,7 +492,7 @@ fn fill_colours(
 ) -> Vec<[f32; 3]> {
     let n = mesh.vertices.len();
     let (mut colour, mut known) = (vec![[0.0f32; 3]; n], vec![0u32; n]);
-    for (v, &o) in split.origin.iter().enumerate().filter(|(v, _)| split.view[*v] != NOTHING) {
+    for (v, &o) in split.origin.iter().enumerate() {
         for k in 0..3 {
             colour[o as usize][k] += (colours[v][k] + corrections[v][k]) as f32;
         }
@@ -620,30 +606,9 @@ mod tests {
         let source = Source { rgb: Raster::new(&rgb, 123, 41, "rgb").unwrap(), projection: CAMERA, gain: [1.0; 3] };
         let labels: Vec<i32> = (0..faces.len()).map(|f| if f % 5 == 0 || f > 90 { NOTHING } else { 0 }).collect();
         let t = build_atlas(mesh, &labels, &[source], 4096).unwrap();
-        assert!((0..t.origin.len()).all(|v| at(&t, v).abs_diff(77) <= 1));
+        assert!((0..t.origin.len()).all(|v| f32::from(at(&t, v).abs_diff(77)) <= SHADE / 2.0));
+        // Faces of one colour share their vertices.
+        assert!(t.origin.len() < vertices.len() * 2, "{}", t.origin.len());
         assert!(build_atlas(mesh, &labels, &[source], 16).is_err());
-    }
-
-    #[test]
-    fn packed_charts_do_not_overlap() {
-        let mut state = 5u32;
-        let mut random = |n: u32| {
-            state = state.wrapping_mul(1664525).wrapping_add(1013904223);
-            ((state >> 16) % n + 1) as usize
-        };
-        let mut charts: Vec<Option<Chart>> = (0..200)
-            .map(|_| Some(Chart { view: 0, from: (0, 0), size: (random(40), random(30)), to: (0, 0) }))
-            .collect();
-        let (width, height, cells) = pack(&mut charts, 10).unwrap();
-        let mut taken = vec![false; width * height];
-        for c in charts.iter().flatten() {
-            for y in c.to.1..c.to.1 + c.size.1 {
-                for x in c.to.0..c.to.0 + c.size.0 {
-                    assert!(x < width && y < cells && !std::mem::replace(&mut taken[y * width + x], true));
-                }
-            }
-        }
-        let used = taken.iter().filter(|&&t| t).count();
-        assert!(used * 10 > width * cells * 6, "{used} of {}", width * cells);
     }
 }

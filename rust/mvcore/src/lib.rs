@@ -1,8 +1,9 @@
 //! Multi-view stereo kernels in plain Rust: arrays in, arrays out, no Python, no I/O beyond mesh and atlas files.
 //!
-//! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`]) ← one file a kernel. Four kernels stand on a part
-//! of their own: [`slanted`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`]; no other calls
-//! another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's global pool; every kernel gives the same bytes for any number of them.
+//! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`]) ← one file a kernel. Five kernels stand on a part
+//! of their own: [`slanted`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`], [`atlas`] on
+//! [`pack`]; no other calls another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's
+//! global pool; every kernel gives the same bytes for any number of them.
 
 pub mod aggregate;
 pub mod atlas;
@@ -19,6 +20,7 @@ pub mod memory;
 pub mod mesh;
 pub mod nearest;
 pub mod nurbs;
+pub mod pack;
 pub mod patch;
 pub mod raster;
 pub mod rasterize;
