@@ -273,7 +273,7 @@ fn splines(c: &mut Criterion) {
     let (u, v): (Vec<f64>, Vec<f64>) = (0..1_000_000).map(|_| (random.next(), random.next())).unzip();
     let g: Vec<f64> = (0..3_000_000).map(|_| random.next()).collect();
     let line: Vec<f64> = (0..1000).map(|i| f64::from(i) / 999.0).collect();
-    let wanted = nurbs::triangle(2);
+    let wanted = nurbs::triangle(2).unwrap();
     let mut group = c.benchmark_group("nurbs, a million points");
     group.sample_size(10).throughput(Throughput::Elements(1_000_000));
     group.bench_function("scattered, second derivatives", |b| {

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, write_scene
 
-EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem != "03_nurbs")
+EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if "nurbs" not in p.stem)
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,14 @@ def test_the_nurbs_example_draws_a_picture(tmp_path):
     picture = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_GRAYSCALE)
     assert 0.1 < (picture < 250).mean() < 0.6
     assert (tmp_path / "nurbs.step").is_file()
+
+
+def test_the_descent_example_gains_by_moving_knots(tmp_path):
+    command = [sys.executable, str(ROOT / "examples" / "04_nurbs_descent.py"), str(tmp_path / "a.obj")]
+    out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    first, second = (float(x) for x in re.findall(r"distance ([\d.]+)", out))
+    assert second < 0.7 * first
+    assert (tmp_path / "a.obj").is_file()
 
 
 @pytest.mark.parametrize("module", ["cameras", "config", "depth", "surface"])

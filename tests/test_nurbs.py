@@ -433,6 +433,8 @@ def test_bad_parameters_are_named_and_clamped_only_when_asked():
     assert np.array_equal(curve.evaluate([-1, 2], outside="clamp"), curve.evaluate([0, 1]))
     for call, name in (
         (lambda: curve.derivatives(0.5, -1), "order"),
+        (lambda: curve.derivatives(0.5, 10**9), "order"),
+        (lambda: sphere.derivatives(0.5, 0.5, 10**9), "order"),
         (lambda: curve.split(0), "u"),
         (lambda: curve.insert_knots([0.5, 0.5, 0.5]), "new"),
         (lambda: sphere.evaluate([0.1, 0.2], [0.1, 0.2, 0.3]), "v"),

@@ -126,7 +126,7 @@ class Surface:
     def _net(self) -> Array:
         return np.ascontiguousarray(self.homogeneous)
 
-    def tangents(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+    def tangent(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Unit tangents (N, dim) along u and along v."""
         d = self.derivatives(u, v, 1)
         return tuple(x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300) for x in (d[1, 0], d[0, 1]))  # type: ignore[return-value]

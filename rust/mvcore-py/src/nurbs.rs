@@ -1,6 +1,7 @@
 //! NURBS kernels: control nets, knots and parameters in; points, derivatives and gradients out.
 
 use crate::convert::{array, run, slice};
+use mvcore::error::require;
 use mvcore::nurbs::{self, Derivative, Knots, Net};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArray4, PyArray5, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -23,6 +24,7 @@ pub fn nurbs_basis<'py>(
     let (first, values, columns) = run(py, || {
         let knots = Knots::new("knots", knots, count)?;
         knots.check("u", u)?;
+        require(order <= nurbs::MAX_ORDER, "order", format!("at most {}", nurbs::MAX_ORDER), order)?;
         let columns = knots.degree() + 1;
         let mut values = vec![0.0; u.len() * (order + 1) * columns];
         let first: Vec<i64> = (u.iter().zip(values.chunks_exact_mut((order + 1) * columns)))
@@ -75,7 +77,7 @@ pub fn nurbs_surface<'py>(
     let (out, dim) = run(py, || {
         let net = Net::new("control_points", control, m, n, dim, rational)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
-        let wanted = nurbs::triangle(order);
+        let wanted = nurbs::triangle(order)?;
         Ok((nurbs::surface_points(&net, knots, u, v, &wanted, (order + 1) * (order + 1))?, net.dim_out()))
     })?;
     array(py, out, (order + 1, order + 1, u.len(), dim))

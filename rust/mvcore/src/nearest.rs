@@ -72,19 +72,23 @@ impl<'a> Cells<'a> {
     /// Squared distance to the nearest point, and its number.
     fn nearest(&self, p: &[f64; 3]) -> (f64, u32) {
         let home = self.cell(p);
+        let high = |k: usize| self.low[k] + self.dims[k] as f64 * self.size;
+        let foot: [f64; 3] = std::array::from_fn(|k| p[k].clamp(self.low[k], high(k)));
+        let outside: f64 = (0..3).map(|k| (p[k] - foot[k]).powi(2)).sum();
         let mut best = (f64::MAX, 0);
         let reach = self.dims.iter().copied().max().unwrap_or(1);
         for ring in 0..=reach {
             self.search_ring(p, home, ring, &mut best);
-            // Everything beyond this ring is at least this far from the cell, and so from the point.
+            // Everything beyond this ring is at least this far from the cell, and so from the point's foot on the box. A point
+            // outside is farther still: its square distance is at least the sum of those to the foot and from there.
             let inside: f64 = (0..3)
                 .map(|k| {
-                    let at = p[k] - self.low[k] - home[k] as f64 * self.size;
-                    at.min(self.size - at)
+                    let at = foot[k] - self.low[k] - home[k] as f64 * self.size;
+                    at.min(self.size - at).max(0.0)
                 })
                 .fold(f64::MAX, f64::min);
             let next = ring as f64 * self.size + inside;
-            if next > 0.0 && best.0 <= next * next {
+            if best.0 <= outside + next * next {
                 break;
             }
         }

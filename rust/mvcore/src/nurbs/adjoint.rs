@@ -3,6 +3,7 @@
 
 use super::knots::{Knots, LANES, TABLED};
 use super::net::Net;
+use super::points::MAX_ORDER;
 use crate::error::{Result, require};
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -38,6 +39,12 @@ pub fn control_gradient(
     require(gradient.len() == u.len() * dim, "gradient", format!("{} x {dim} values", u.len()), gradient.len())?;
     knots[0].check("u", u)?;
     knots[1].check("v", v)?;
+    require(
+        orders.iter().all(|&k| k <= MAX_ORDER),
+        "orders",
+        format!("at most {MAX_ORDER}"),
+        orders[0].max(orders[1]),
+    )?;
     let (m, n) = (knots[0].count(), knots[1].count());
     let blocks = dim.div_ceil(LANES);
     let stride = (n + TABLED) * blocks;
@@ -138,6 +145,7 @@ pub fn curve_control_gradient(
 ) -> Result<Vec<f64>> {
     require(gradient.len() == u.len() * dim, "gradient", format!("{} x {dim} values", u.len()), gradient.len())?;
     knots.check("u", u)?;
+    require(order <= MAX_ORDER, "order", format!("at most {MAX_ORDER}"), order)?;
     let (p, len) = (knots.degree(), knots.count() * dim);
     let size = part_size(u.len(), len);
     let part = |(u, g): (&[f64], &[f64])| {

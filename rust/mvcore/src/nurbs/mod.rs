@@ -17,4 +17,4 @@ mod rational;
 pub use adjoint::{control_gradient, curve_control_gradient, curve_knot_gradient, knot_gradient};
 pub use knots::{Knots, MAX_DEGREE};
 pub use net::Net;
-pub use points::{Derivative, curve_points, surface_grid, surface_points, triangle};
+pub use points::{Derivative, MAX_ORDER, curve_points, surface_grid, surface_points, triangle};

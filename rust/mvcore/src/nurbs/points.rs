@@ -22,10 +22,18 @@ pub struct Derivative {
     pub slot: usize,
 }
 
+/// Highest sum of orders of a derivative.
+pub const MAX_ORDER: usize = 64;
+
+fn check_order(order: usize) -> Result<()> {
+    require(order <= MAX_ORDER, "order", format!("at most {MAX_ORDER}"), order)
+}
+
 /// All derivatives with `u + v <= order`, in slots of an (order + 1)² table.
-pub fn triangle(order: usize) -> Vec<Derivative> {
+pub fn triangle(order: usize) -> Result<Vec<Derivative>> {
+    check_order(order)?;
     let row = |u: usize| (0..=order - u).map(move |v| Derivative { u, v, slot: u * (order + 1) + v });
-    (0..=order).flat_map(row).collect()
+    Ok((0..=order).flat_map(row).collect())
 }
 
 /// The slots' rows for each chunk of points: `parts[chunk][n]` belongs to `wanted[n]`.
@@ -52,7 +60,9 @@ fn checked(wanted: &[Derivative]) -> Result<(usize, usize)> {
     slot.sort_unstable();
     slot.dedup();
     require(slot.len() == wanted.len(), "wanted", "a slot for each derivative", "one slot twice")?;
-    Ok((wanted.iter().map(|d| d.u + d.v).max().unwrap_or(0), slots))
+    let order = wanted.iter().map(|d| d.u.saturating_add(d.v)).max().unwrap_or(0);
+    check_order(order)?;
+    Ok((order, slots))
 }
 
 /// Derivatives of a surface at scattered parameters; `slots` results of (n, dim), those not wanted zero.
@@ -249,6 +259,7 @@ fn scattered(
 /// Derivatives of a curve, a net of one column, at scattered parameters: (order + 1, n, dim).
 pub fn curve_points(net: &Net, knots: &Knots, u: &[f64], order: usize) -> Result<Vec<f64>> {
     knots.check("u", u)?;
+    check_order(order)?;
     let dim = net.dim_out();
     let mut out = zeroed::<f64>((order + 1) * u.len() * dim);
     let wanted: Vec<Derivative> = (0..=order).map(|k| Derivative { u: k, v: 0, slot: k }).collect();
@@ -312,7 +323,7 @@ pub fn surface_grid(net: &Net, knots: [&Knots; 2], u: &[f64], v: &[f64], order: 
     knots[0].check("u", u)?;
     knots[1].check("v", v)?;
     let dim = net.dim_out();
-    let wanted = triangle(order);
+    let wanted = triangle(order)?;
     let size = u.len() * v.len() * dim;
     let mut out = zeroed::<f64>((order + 1) * (order + 1) * size);
     if size == 0 {
