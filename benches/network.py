@@ -23,11 +23,12 @@ import cv2
 import mvcore
 import numpy as np
 import torch
+from mvcore import depth as depth_stage
 from mvcore import metrics, sparse
-from mvcore.config import Config
+from mvcore.config import Config, DepthConfig
 from mvcore.io.images import load_frame
 from mvcore.network.batches import Recipe, make_batch
-from mvcore.network.match import SHIPPED, Matcher, planes_for
+from mvcore.network.match import SHIPPED, Matcher, planes_for, shipped_matcher
 from mvcore.network.train_disparity import Training, train_disparity, validate
 from mvcore.network.weights import load_disparity
 from peers import PAIRS
@@ -49,10 +50,10 @@ def size(arguments):
     images = [random.integers(0, 255, (height, width, 3), np.uint8) for _ in range(5)]
     K = [[900, 0, (width - 1) / 2], [0, 900, (height - 1) / 2], [0, 0, 1]]
     cameras = [mvcore.Camera(K, np.eye(3), [-0.1 * k, 0, 0], width, height) for k in range(5)]
-    views = [mvcore.depth.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
+    views = [depth_stage.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
     for name, job in (
         ("network alone, full size", lambda: matcher.depth(images[0], cameras[0], images[1:], cameras[1:], 2, 8)),
-        ("first pass as in the pipeline", lambda: mvcore.depth.network_depth(views[0], views[1:], 2, 8)),
+        ("first pass as in the pipeline", lambda: depth_stage.network_depth(views[0], views[1:], 2, 8)),
     ):
         job()
         started, cpu = time.perf_counter(), time.process_time()
@@ -71,15 +72,23 @@ def _compared(matcher, pairs):
     rows = []
     for name, left, right, truth, clear in pairs:
         most = int(np.ceil((truth[np.isfinite(truth)].max() + 1) / 16) * 16)
-        found = {"network": matcher.disparity(left, right, most)[0], "sgm": mvcore.disparity(left, right, max_disparity=most)[0]}
+        raw = matcher.disparity(left, right, most)[0]
+        grey = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in (left, right)]
+        fine = depth_stage.polished(raw, *grey, (0, most), DepthConfig())
+        found = {"network": raw, "polished": fine, "sgm": mvcore.disparity(left, right, max_disparity=most)[0]}
         peer = cv2.StereoSGBM_create(0, most, 5, 8 * 75, 32 * 75, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH)
         found["HH"] = peer.compute(left[..., ::-1].copy(), right[..., ::-1].copy()).astype(np.float32) / 16
         bad = {k: metrics.disparity_metrics(d, truth)["bad_2"] for k, d in found.items()}
         if clear is not None:
             bad |= {f"{k}, not hidden": metrics.disparity_metrics(d, truth, clear)["bad_2"] for k, d in found.items()}
+        bad |= {f"{k}, median px": metrics.disparity_metrics(d, truth)["median"] for k, d in found.items()}
         rows.append(bad)
-        print(f"  {name:12s}" + "".join(f"  {k} {100 * v:5.1f} %" for k, v in bad.items()), flush=True)
-    print(f"  {'mean':12s}" + "".join(f"  {k} {100 * np.mean([r[k] for r in rows]):5.1f} %" for k in rows[0]))
+        print(f"  {name:12s}" + _said(bad), flush=True)
+    print(f"  {'mean':12s}" + _said({k: np.mean([r[k] for r in rows]) for k in rows[0]}))
+
+
+def _said(figures):
+    return "".join(f"  {k} {v:.3f}" if k.endswith("px") else f"  {k} {100 * v:.1f} %" for k, v in figures.items())
 
 
 def stereo(arguments):
@@ -124,20 +133,20 @@ def views(arguments):
         box = sparse.target_box(cameras, points)
         ranges = sparse.depth_ranges(cameras, points, box, config.sparse.range_stretch, False)
         sources = sparse.choose_sources(sparse.view_scores(cameras, points, box, config.depth), config.depth.sources)
-        gray = [mvcore.depth.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
+        gray = [depth_stage.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
         scale = json.loads((folder / "cameras.json").read_text())["depth_scale"]
         shares = {"network": [], "network, polished": [], "sgm": []}
-        mvcore.network.match.shipped_matcher.cache_clear()
+        shipped_matcher.cache_clear()
         for n in np.unique(np.linspace(0, len(images) - 1, arguments.count).astype(int)):
             truth = _truth(folder, scene.frames[n], "depth").astype(np.float32) * scale
             mask = _truth(folder, scene.frames[n], "masks") > 0
             near = [gray[j] for j in sources[n]]
             inverse, _ = matcher.depth(images[n], cameras[n], [v.colour for v in near[:4]], [v.camera for v in near[:4]], *ranges[n])
-            rough = mvcore.depth.network_depth(gray[n], near, *ranges[n])
+            rough = depth_stage.network_depth(gray[n], near, *ranges[n])
             found = {
                 "network": 1 / np.maximum(inverse, 1e-9),
-                "network, polished": mvcore.depth.refine_depth(gray[n], near, rough, ()).depth,
-                "sgm": mvcore.depth.estimate_depth(gray[n], near, *ranges[n]).depth,
+                "network, polished": depth_stage.refine_depth(gray[n], near, rough, ()).depth,
+                "sgm": depth_stage.estimate_depth(gray[n], near, *ranges[n]).depth,
             }
             for name, depth in found.items():
                 shares[name].append(metrics.depth_metrics(depth, truth, mask & (truth > 0))["within_1_percent"])

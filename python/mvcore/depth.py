@@ -136,11 +136,15 @@ def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthCon
     costs = _core.sweep(scale.greys[0], scale.greys[1:], scale.there, inverse)
     index, margin = _core.aggregate(costs, scale.greys[0], config.p1, config.p2, config.p2_falloff)
     del costs
-    prior = (low + index * step).astype(np.float32)
+    return _around(scale, (low + index * step).astype(np.float32), margin, (low, high), step, config)
+
+
+def _around(scale: _Scale, prior: Map, margin: Map, span: tuple[float, float], step: float, config: DepthConfig) -> _Hypotheses:
+    """Slanted planes refined around a first solution."""
     a, b = _slopes(prior)
     start = np.stack([prior, a, b, np.zeros_like(a)], -1)
-    refined = _refine(scale, start, prior, (low, high), step, config.sweep_rounds, config, config.prior_reach)
-    return _Hypotheses(refined, prior, margin, (low, high), step)
+    refined = _refine(scale, start, prior, span, step, config.sweep_rounds, config, config.prior_reach)
+    return _Hypotheses(refined, prior, margin, span, step)
 
 
 def _finer(coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig, depths: list[Map] = NO_DEPTHS) -> _Hypotheses:
@@ -215,29 +219,26 @@ def network_depth(
     reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None, device: str = "cpu"
 ) -> RoughDepth:
     """First pass by the network. Parameters and errors as of `sweep_depth`; views need colours; ``device`` is ``cpu`` or ``cuda``."""
-    from .network.match import PLANES, shipped_matcher
+    from .network.match import shipped_matcher
 
     config = config or DepthConfig()
     _check(sources, near, far)
     share = min(1.0, NETWORK_SIDE / max(reference.grey.shape))
     images, cameras = zip(*(_coloured(v, n, share) for n, v in enumerate([reference, *sources[:NETWORK_SOURCES]])), strict=True)
     inverse, confidence = shipped_matcher(device).depth(images[0], cameras[0], images[1:], cameras[1:], near, far)
-    h, w = reference.grey.shape
-    sizes = _scales(w, h, config.coarsest)
-    w, h = sizes[-2] if len(sizes) > 1 else sizes[-1]
-    inverse = cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
-    a, b = _slopes(inverse)
-    planes = np.stack([inverse, a, b, np.zeros_like(a)], -1)
-    # The second pass searches about a pixel of parallax: what the network's own last stage resolves.
-    step = (1 / near - 1 / far) / (PLANES - 1) * NETWORK_STEP
+    # From here on it is what the aggregation's solution is to the classical matcher.
+    coarsest, *finer = _pyramid(reference, sources, config)
+    h, w = coarsest.greys[0].shape
+    prior = cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
     margin = cv2.resize(confidence, (w, h), interpolation=cv2.INTER_LINEAR) / 4
-    return RoughDepth(_Hypotheses(planes, inverse, margin, (1 / far, 1 / near), step))
+    found = _around(coarsest, prior, margin, (1 / far, 1 / near), (1 / near - 1 / far) / (config.planes - 1), config)
+    for scale in finer[:-1]:
+        found = _finer(found, scale, config.rounds, config)
+    return RoughDepth(found)
 
 
 NETWORK_SOURCES = 4
 """Source views that the network looks at."""
-NETWORK_STEP = 0.25
-"""Interval of its last stage in planes of its first."""
 
 
 def _coloured(view: View, number: int, share: float) -> tuple[NDArray[np.uint8], Camera]:
@@ -359,7 +360,8 @@ def disparity(
     require(max_disparity > min_disparity, "max_disparity", f"more than min_disparity ({min_disparity})", max_disparity)
     require(matcher in MATCHERS, "matcher", f"one of {', '.join(MATCHERS)}", repr(matcher))
     if matcher == "dcnn":
-        return _network_disparity(left, right, max_disparity, min_disparity, fill, device)
+        found, sure = _network_disparity(left, right, max_disparity, min_disparity, fill, device)
+        return polished(found, images[0], images[1], (min_disparity, max_disparity), config), sure
     mine = _rectified(images[0], images[1], min_disparity, max_disparity, config)
     flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
@@ -374,6 +376,14 @@ def disparity(
     if not fill:
         return np.where(seen, d, 0).astype(np.float32), confidence
     return _fill_occlusions(d, seen, images[0]), confidence
+
+
+def polished(d: Map, left: Grey, right: Grey, span: tuple[float, float], config: DepthConfig) -> Map:
+    """Disparity (h, w) refined below the pixel by slanted windows; it moves by less than a pixel, and holes (0) stay."""
+    scale = _Scale([left, right], RECTIFIED, NO_BACKS, 1.0)
+    start = np.stack([d, *_slopes(d), np.zeros_like(d)], -1)
+    fine = _refine(scale, start, d, (float(span[0]), float(span[1])), 0.5, config.rounds, config, config.prior_reach)[..., 0]
+    return np.where((np.abs(fine - d) < 1) & (d > 0), fine, d).astype(np.float32)
 
 
 def _network_disparity(left: Grey, right: Grey, high: int, low: int, fill: bool, device: str) -> tuple[Map, Map]:
