@@ -72,7 +72,7 @@ def _compared(matcher, pairs):
     rows = []
     for name, left, right, truth, clear in pairs:
         most = int(np.ceil((truth[np.isfinite(truth)].max() + 1) / 16) * 16)
-        raw = matcher.disparity(left, right, most)[0]
+        raw, sure = matcher.disparity(left, right, most)
         grey = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in (left, right)]
         fine = depth_stage.polished(raw, *grey, (0, most), DepthConfig())
         found = {"network": raw, "polished": fine, "sgm": mvcore.disparity(left, right, max_disparity=most)[0]}
@@ -81,6 +81,10 @@ def _compared(matcher, pairs):
         bad = {k: metrics.disparity_metrics(d, truth)["bad_2"] for k, d in found.items()}
         if clear is not None:
             bad |= {f"{k}, not hidden": metrics.disparity_metrics(d, truth, clear)["bad_2"] for k, d in found.items()}
+        known = np.isfinite(truth) & (truth > 0)
+        wrong = (np.abs(raw - truth) > 2)[known]
+        doubtful = sure[known] <= np.quantile(sure[known], 0.1)
+        bad["network's bad among its least confident tenth"] = (wrong & doubtful).sum() / max(1, wrong.sum())
         bad |= {f"{k}, median px": metrics.disparity_metrics(d, truth)["median"] for k, d in found.items()}
         rows.append(bad)
         print(f"  {name:12s}" + _said(bad), flush=True)

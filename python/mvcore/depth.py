@@ -360,8 +360,7 @@ def disparity(
     require(max_disparity > min_disparity, "max_disparity", f"more than min_disparity ({min_disparity})", max_disparity)
     require(matcher in MATCHERS, "matcher", f"one of {', '.join(MATCHERS)}", repr(matcher))
     if matcher == "dcnn":
-        found, sure = _network_disparity(left, right, max_disparity, min_disparity, fill, device)
-        return polished(found, images[0], images[1], (min_disparity, max_disparity), config), sure
+        return _network_disparity(images, (left, right), min_disparity, max_disparity, fill, device, config)
     mine = _rectified(images[0], images[1], min_disparity, max_disparity, config)
     flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
@@ -379,19 +378,22 @@ def disparity(
 
 
 def polished(d: Map, left: Grey, right: Grey, span: tuple[float, float], config: DepthConfig) -> Map:
-    """Disparity (h, w) refined below the pixel by slanted windows; it moves by less than a pixel, and holes (0) stay."""
+    """Disparity (h, w) refined below the pixel by slanted windows; it moves by less than a pixel."""
     scale = _Scale([left, right], RECTIFIED, NO_BACKS, 1.0)
     start = np.stack([d, *_slopes(d), np.zeros_like(d)], -1)
     fine = _refine(scale, start, d, (float(span[0]), float(span[1])), 0.5, config.rounds, config, config.prior_reach)[..., 0]
-    return np.where((np.abs(fine - d) < 1) & (d > 0), fine, d).astype(np.float32)
+    return np.where(np.abs(fine - d) < 1, fine, d).astype(np.float32)
 
 
-def _network_disparity(left: Grey, right: Grey, high: int, low: int, fill: bool, device: str) -> tuple[Map, Map]:
+def _network_disparity(
+    greys: list[Grey], pair: Sequence[NDArray[np.uint8]], low: int, high: int, fill: bool, device: str, config: DepthConfig
+) -> tuple[Map, Map]:
     from .network.match import shipped_matcher
 
-    views = [np.repeat(i[..., None], 3, 2) if i.ndim == 2 else i for i in (left, right)]
+    views = [np.repeat(i[..., None], 3, 2) if i.ndim == 2 else i for i in pair]
     network = shipped_matcher(device)
     d, confidence = network.disparity(views[0], views[1], high, low)
+    d = polished(d, greys[0], greys[1], (low, high), config)
     if fill:
         return d, confidence
     other = network.disparity(views[1][:, ::-1], views[0][:, ::-1], high, low)[0][:, ::-1]

@@ -27,7 +27,7 @@ MULTIPLE = 16
 """The network's sides are a multiple of this."""
 PLANES = 48
 """Planes of the first stage for a posed view, uniform in inverse depth."""
-PIXELS_A_PLANE = 1.5
+PIXELS_A_PLANE = 1.9
 """Disparity between planes of the first stage for a rectified pair."""
 RECTIFIED = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, -1, 0, 0], np.float32)
 """The relative map of a rectified pair: inverse depth is disparity."""
