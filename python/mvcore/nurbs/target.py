@@ -131,8 +131,13 @@ def _sections(local: Array, faces: NDArray[np.int64] | None, count: int, points:
     share = (1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2
     heights = low + (high - low) * share
     loops, kept, total = [], 0.0, 0.0
+    if faces is not None:
+        least, most = (f(local[faces, 2], 1) for f in (np.min, np.max))
     for z in heights:
-        loop, own, every = _slab(local, z, (high - low) / count) if faces is None else _largest_loop(local, faces, z)
+        if faces is None:
+            loop, own, every = _slab(local, z, (high - low) / count)
+        else:
+            loop, own, every = _largest_loop(local, faces[(least <= z) & (z < most)], z)
         total, kept = total + every, kept + own
         if loop is not None:
             loops.append(np.column_stack([_resampled(loop, points), np.full(points, z)]))
@@ -148,13 +153,12 @@ def _sections(local: Array, faces: NDArray[np.int64] | None, count: int, points:
     return np.stack([*ends[0], *loops, *reversed(ends[1])]), 1 - kept / max(total, 1e-300)
 
 
-def _largest_loop(local: Array, faces: NDArray[np.int64], z: float) -> tuple[Array | None, float, float]:
-    """The loop of greatest area in which the plane at height ``z`` cuts the mesh; its length and that of all loops.
+def _largest_loop(local: Array, cut: NDArray[np.int64], z: float) -> tuple[Array | None, float, float]:
+    """The loop of greatest area in which the plane at height ``z`` cuts the mesh, by the faces that it cuts; its length and that of all loops.
 
     Where that is a minor part, as in an open mesh or among many parts, the outline of the whole section stands in.
     """
     above = local[:, 2] > z
-    cut = faces[(above[faces].sum(1) % 3) != 0]
     edges = np.stack([cut, np.roll(cut, -1, 1)], 2)
     crossing = above[edges[..., 0]] != above[edges[..., 1]]
     # Of a face's two crossing edges, the one entered first as the face runs round: from above to below, then from below to above.
