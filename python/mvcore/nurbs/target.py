@@ -154,7 +154,7 @@ def _sections(local: Array, faces: NDArray[np.int64] | None, count: int, points:
 
 
 def _largest_loop(local: Array, cut: NDArray[np.int64], z: float) -> tuple[Array | None, float, float]:
-    """The loop of greatest area in which the plane at height ``z`` cuts the mesh, by the faces that it cuts; its length and that of all loops.
+    """The loop of greatest area in which the plane at height ``z`` cuts the mesh, by the faces that it cuts; its length and that of all.
 
     Where that is a minor part, as in an open mesh or among many parts, the outline of the whole section stands in.
     """
