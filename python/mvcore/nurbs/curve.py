@@ -23,7 +23,7 @@ from .checks import (
     plain,
     removal_scale,
 )
-from .search import between, descend, extremes, nearest, sampled, subdivided
+from .search import between, creases, extremes, nearest, project, sampled, subdivided
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,26 +149,15 @@ class Curve:
         """Parameters (N,), points (N, dim) and distances (N,) of the curve's points nearest to ``points`` (inversion, section 6.1)."""
         wanted = floats(points, "points", 2)
         require(wanted.shape[1] == self.control_points.shape[1], "points", f"{self.control_points.shape[1]} columns", wanted.shape)
-        low, high = self.domain
         start = between(self.breaks, 4 * self.degree)
-        u = start[nearest(self.evaluate(start), wanted)]
-        closed = [self.is_closed]
+        at = start[nearest(self.evaluate(start), wanted)][:, None]
 
-        def cost(x: Array) -> Array:
-            return np.asarray(((self.evaluate(x[:, 0]) - wanted) ** 2).sum(1))
+        def jets(x: Array) -> tuple[Array, Array, Array]:
+            points, first, second = self.derivatives(x[:, 0], 2)
+            return points, first[:, None], second[:, None, None]
 
-        best = cost(u[:, None])
-        for _ in range(60):
-            c, d, dd = self.derivatives(u, 2)
-            off = c - wanted
-            slope = np.einsum("ni,ni->n", d, off)
-            speed = np.einsum("ni,ni->n", d, d)
-            bend = speed + np.einsum("ni,ni->n", dd, off)
-            step = -slope / np.maximum(np.where(bend > 1e-3 * speed, bend, speed), 1e-300)
-            moved_u, best, moved = descend(cost, u[:, None], step[:, None], best, [(low, high)], closed)
-            u = moved_u[:, 0]
-            if moved <= 1e-15 * (high - low):
-                break
+        edges = [creases(self.knots, self.degree)]
+        u = project(jets, lambda x: self.evaluate(x[:, 0]), wanted, at, edges, [self.is_closed])[:, 0].copy()
         found = self.evaluate(u)
         return u, found, np.linalg.norm(found - wanted, axis=1)
 

@@ -87,6 +87,10 @@ def _removal(knots: Array, rows: Array, last: int) -> tuple[float, Array, int]:
     s = multiplicity(knots, u) - 1
     rest = np.delete(knots, last)
     k = last - 1
+    if s == p:
+        # The spline jumps here: without the knot its two points are one.
+        gap = rows[k - p + 1] - rows[k - p]
+        return float(np.abs(gap).max()), rows[:0], int(k - p + 1)
     i = np.arange(k - p + 1, k - s + 1)
     alpha = (u - rest[i]) / (rest[i + p] - rest[i])
     # Row i of the present points is alpha Q_i + (1 - alpha) Q_(i-1); Q before and after the window are present points.

@@ -42,29 +42,91 @@ def nearest(points: Array, wanted: Array, size: int = 1 << 22) -> NDArray[np.int
     return found
 
 
-def descend(
-    cost: Callable[[Array], Array], at: Array, step: Array, best: Array, domain: list[tuple[float, float]], closed: list[bool]
-) -> tuple[Array, Array, float]:
-    """One damped step of many independent minimisations: shortened where the cost would rise; the greatest move comes back too.
+def creases(knots: Array, degree: int) -> Array:
+    """The ends of the domain and the knots between them at which the tangent may jump."""
+    low, high = knots[degree], knots[-degree - 1]
+    values, times = np.unique(knots, return_counts=True)
+    return np.concatenate([[low], values[(times >= degree) & (values > low) & (values < high)], [high]])
 
-    Along a closed parameter a step goes on at the other end of the domain; along an open one it ends there.
+
+Jets = Callable[[Array], tuple[Array, Array, Array]]
+"""Parameters (N, d) to points (N, dim), first derivatives (N, d, dim) and second ones (N, d, d, dim)."""
+
+
+def project(jets: Jets, evaluate: Callable[[Array], Array], wanted: Array, at: Array, edges: list[Array], closed: list[bool]) -> Array:
+    """Parameters (N, d) of the points nearest to ``wanted`` (N, dim), from starts ``at`` (N, d): inversion, section 6.1.
+
+    Newton within the smooth piece of the shape that a start lies in; ``edges`` are the pieces' ends along each parameter. What ends on
+    a piece's edge is tried in the piece beyond, round the seam where ``closed``.
     """
-    low, high = np.array(domain).T
-    round_again = np.array(closed)
-    moved = np.zeros(len(at))
-    waiting = np.ones(len(at), bool)
+    piece = np.stack([np.clip(np.searchsorted(e, x, "right") - 1, 0, len(e) - 2) for e, x in zip(edges, at.T, strict=True)], 1)
+
+    def bounds(of: NDArray[np.intp]) -> tuple[Array, Array]:
+        low = np.stack([e[k] for e, k in zip(edges, of.T, strict=True)], 1)
+        high = np.stack([e[k + 1] for e, k in zip(edges, of.T, strict=True)], 1)
+        # Derivatives at an inner edge are those of the piece after it: the piece before ends just short of it.
+        last = np.array([len(e) - 2 for e in edges])
+        return low, np.where(of == last, high, np.nextafter(high, low))
+
+    at, best = _newton(jets, evaluate, wanted, at, *bounds(piece))
+    active = np.arange(len(at))
     for _ in range(8):
-        trial = np.where(waiting[:, None], at + step, at)
-        trial = np.where(round_again, low + (trial - low) % (high - low), trial).clip(low, high)
-        value = cost(trial)
-        better = waiting & (value < best)
-        moved[better] = np.abs(step)[better].max(1)
-        at, best = np.where(better[:, None], trial, at), np.where(better, value, best)
-        waiting &= ~better
-        step = step / 4
-        if not waiting.any():
+        improved: list[NDArray[np.intp]] = []
+        for k, e in enumerate(edges):
+            for side in (-1, 1):
+                low, high = bounds(piece[active])
+                there = at[active, k] <= low[:, k] if side < 0 else at[active, k] >= high[:, k]
+                beyond = piece[active, k] + side
+                there &= closed[k] | ((beyond >= 0) & (beyond < len(e) - 1))
+                some = active[there]
+                next_piece, start = piece[some].copy(), at[some].copy()
+                next_piece[:, k] = beyond[there] % (len(e) - 1)
+                low, high = bounds(next_piece)
+                start[:, k] = high[:, k] if side < 0 else low[:, k]
+                found, value = _newton(jets, evaluate, wanted[some], start, low, high)
+                better = value < best[some]
+                some = some[better]
+                at[some], best[some], piece[some] = found[better], value[better], next_piece[better]
+                improved.append(some)
+        active = np.unique(np.concatenate(improved))
+        if not len(active):
             break
-    return at, best, float(moved.max(initial=0.0))
+    return at
+
+
+def _newton(jets: Jets, evaluate: Callable[[Array], Array], wanted: Array, at: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Parameters and square distances of the nearest points within boxes of parameters (N, d): damped Newton steps."""
+    at = at.clip(low, high)
+    best = ((evaluate(at) - wanted) ** 2).sum(1)
+    axes = np.arange(at.shape[1])
+    for _ in range(60 if len(at) else 0):
+        points, first, second = jets(at)
+        off = points - wanted
+        slope = np.einsum("nid,nd->ni", first, off)
+        metric = np.einsum("nid,njd->nij", first, first)
+        hessian = metric + np.einsum("nijd,nd->nij", second, off)
+        # Newton where the Hessian is safely positive, Gauss-Newton elsewhere; on a box's edge only free parameters move.
+        safe = (hessian[:, 0, 0] > 1e-3 * metric[:, 0, 0]) & (np.linalg.det(hessian) > 1e-3 * np.linalg.det(metric))
+        hessian = np.where(safe[:, None, None], hessian, metric)
+        held = ((at <= low) & (slope > 0)) | ((at >= high) & (slope < 0))
+        hessian = np.where(held[:, :, None] | held[:, None, :], 0.0, hessian)
+        size = np.einsum("nii->n", metric)[:, None] + 1e-300
+        hessian[:, axes, axes] += np.where(held, 1.0, 1e-14 * size)
+        step = -np.linalg.solve(hessian, np.where(held, 0.0, slope)[..., None])[..., 0]
+        waiting, moved = np.ones(len(at), bool), 0.0
+        for _ in range(8):
+            trial = np.where(waiting[:, None], at + step, at).clip(low, high)
+            value = ((evaluate(trial) - wanted) ** 2).sum(1)
+            better = waiting & (value < best)
+            moved = max(moved, float(np.abs(trial - at)[better].max(initial=0.0)))
+            at, best = np.where(better[:, None], trial, at), np.where(better, value, best)
+            waiting &= ~better
+            if not waiting.any():
+                break
+            step = step / 4
+        if moved <= 1e-15 * float((high - low).max()):
+            break
+    return at, best
 
 
 def extremes(evaluate: Callable[[Array], Array], axes: list[Array]) -> Array:

@@ -26,7 +26,7 @@ from .checks import (
     removal_scale,
 )
 from .curve import Curve
-from .search import between, descend, extremes, nearest, sampled, subdivided
+from .search import between, creases, extremes, nearest, project, sampled, subdivided
 
 Direction = Literal["u", "v"]
 Edit = Callable[[Array, Array], tuple[Array, Array]]
@@ -169,48 +169,24 @@ class Surface:
     def closest_point(self, points: ArrayLike) -> tuple[Array, Array, Array, Array]:
         """u, v (N,), points (N, dim) and distances (N,) of the surface's points nearest to ``points`` (inversion, section 6.1).
 
-        Newton from the nearest of a grid of samples, twice the degree a span: a nearer point that no sample leads to is missed.
+        Newton from the nearest of a grid of samples, twice the degree and two a span: a nearer point that no sample leads to is missed.
         """
         wanted = floats(points, "points", 2)
         dim = self.control_points.shape[2]
         require(wanted.shape[1] == dim, "points", f"{dim} columns", wanted.shape)
-        axes = [between(b, 2 * p) for b, p in zip(self.breaks, self.degree, strict=True)]
+        axes = [between(b, 2 * p + 2) for b, p in zip(self.breaks, self.degree, strict=True)]
         number = nearest(self.evaluate_grid(*axes).reshape(-1, dim), wanted)
         at = np.stack([axes[0][number // len(axes[1])], axes[1][number % len(axes[1])]], 1)
 
-        def cost(x: Array) -> Array:
-            return np.asarray(((self.evaluate(x[:, 0], x[:, 1]) - wanted) ** 2).sum(1))
+        def jets(x: Array) -> tuple[Array, Array, Array]:
+            d = self.derivatives(x[:, 0], x[:, 1], 2)
+            across = np.stack([d[1, 1], d[0, 2]], 1)
+            return d[0, 0], np.stack([d[1, 0], d[0, 1]], 1), np.stack([np.stack([d[2, 0], d[1, 1]], 1), across], 1)
 
-        best, closed = cost(at), list(self.is_closed)
-        spread = np.array([high - low for low, high in self.domain])
-        for _ in range(60):
-            at, best, moved = descend(cost, at, self._newton(at, wanted, closed), best, list(self.domain), closed)
-            if moved <= 1e-15 * spread.max():
-                break
+        edges = [creases(k, p) for k, p in zip(self.knots, self.degree, strict=True)]
+        at = project(jets, lambda x: self.evaluate(x[:, 0], x[:, 1]), wanted, at, edges, list(self.is_closed))
         found = self.evaluate(at[:, 0], at[:, 1])
         return at[:, 0].copy(), at[:, 1].copy(), found, np.linalg.norm(found - wanted, axis=1)
-
-    def _newton(self, at: Array, wanted: Array, closed: list[bool]) -> Array:
-        d = self.derivatives(at[:, 0], at[:, 1], 2)
-        off, su, sv = d[0, 0] - wanted, d[1, 0], d[0, 1]
-
-        def dot(a: Array, b: Array) -> Array:
-            return np.asarray(np.einsum("ni,ni->n", a, b))
-
-        slope = np.stack([dot(su, off), dot(sv, off)], 1)
-        first = np.stack([np.stack([dot(su, su), dot(su, sv)], 1), np.stack([dot(su, sv), dot(sv, sv)], 1)], 1)
-        second = np.stack([np.stack([dot(d[2, 0], off), dot(d[1, 1], off)], 1), np.stack([dot(d[1, 1], off), dot(d[0, 2], off)], 1)], 1)
-        # Newton where the Hessian is safely positive, Gauss-Newton elsewhere; at the domain's edge only the free parameter moves.
-        hessian = first + second
-        safe = (hessian[:, 0, 0] > 1e-3 * first[:, 0, 0]) & (np.linalg.det(hessian) > 1e-3 * np.linalg.det(first))
-        hessian = np.where(safe[:, None, None], hessian, first)
-        low, high = np.array(self.domain).T
-        held = ((at <= low) & (slope > 0)) | ((at >= high) & (slope < 0))
-        held &= ~np.array(closed)
-        hessian = np.where(held[:, :, None] | held[:, None, :], 0.0, hessian)
-        size = np.einsum("nii->n", first)[:, None] + 1e-300
-        hessian[:, (0, 1), (0, 1)] += np.where(held, 1.0, 1e-14 * size)
-        return np.asarray(-np.linalg.solve(hessian, np.where(held, 0.0, slope)[..., None])[..., 0])
 
     def bounding_box(self) -> Array:
         """(2, dim) least and greatest coordinates of the surface itself, not of its control points."""
