@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import InvalidInputError, nurbs
 from mvcore.errors import FormatError
+from mvcore.metrics import nearest_distance
 from mvcore.nurbs.fit import collocation
 
 GRID = np.linspace(0, 1, 83)
@@ -224,6 +225,24 @@ def test_closest_points_of_a_sphere_a_circle_and_beyond_the_seam():
     assert np.abs(nurbs.sphere(2.0).evaluate(u, v) - found).max() == 0
     _u, _p, distance = nurbs.circle(3.0).closest_point(points)
     assert np.abs(distance - np.hypot(np.hypot(*points[:, :2].T) - 3, points[:, 2])).max() < 1e-9
+
+
+def test_closest_points_across_creases_are_not_farther_than_dense_samples():
+    random = np.random.default_rng(3)
+    bumps = random.normal(0, 0.1, (7, 5))
+    net = np.stack([*np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 5), indexing="ij"), bumps], -1)
+    surface = nurbs.Surface(net, [0, 0, 0, 0, 0.25, 0.5, 0.75, 1, 1, 1, 1], [0, 0, 0.25, 0.5, 0.75, 1, 1])
+    points = surface.evaluate(random.random(500), random.random(500)) + random.normal(0, 0.02, (500, 3))
+    distance = surface.closest_point(points)[3]
+    dense = surface.evaluate_grid(np.linspace(0, 1, 400), np.linspace(0, 1, 400)).reshape(-1, 3)
+    assert (distance <= nearest_distance(points, dense) + 1e-12).mean() > 0.995
+
+
+def test_a_jump_is_not_removed():
+    curve = nurbs.Curve([[0, 0], [1, 0], [1, 1], [2, 1]], [0, 0, 0.5, 0.5, 1, 1])
+    assert len(curve.remove_knots(0.5).knots) == 6
+    joined = nurbs.Curve([[0, 0], [1, 0], [1, 0], [2, 1]], [0, 0, 0.5, 0.5, 1, 1])
+    assert len(joined.remove_knots(1e-9).knots) == 5
 
 
 def test_bounding_box_is_tight():

@@ -169,12 +169,12 @@ class Surface:
     def closest_point(self, points: ArrayLike) -> tuple[Array, Array, Array, Array]:
         """u, v (N,), points (N, dim) and distances (N,) of the surface's points nearest to ``points`` (inversion, section 6.1).
 
-        Newton from the nearest of a grid of samples, twice the degree and two a span: a nearer point that no sample leads to is missed.
+        Newton from the nearest of a grid of samples, at least eight a span each way: a nearer point that no sample leads to is missed.
         """
         wanted = floats(points, "points", 2)
         dim = self.control_points.shape[2]
         require(wanted.shape[1] == dim, "points", f"{dim} columns", wanted.shape)
-        axes = [between(b, 2 * p + 2) for b, p in zip(self.breaks, self.degree, strict=True)]
+        axes = [between(b, max(8, 2 * p)) for b, p in zip(self.breaks, self.degree, strict=True)]
         number = nearest(self.evaluate_grid(*axes).reshape(-1, dim), wanted)
         at = np.stack([axes[0][number // len(axes[1])], axes[1][number % len(axes[1])]], 1)
 
