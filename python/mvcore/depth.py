@@ -364,17 +364,20 @@ def disparity(
     mine = _rectified(images[0], images[1], min_disparity, max_disparity, config)
     flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
-    other = theirs[:, ::-1, 0]
     d = mine[..., 0]
-    _h, w = d.shape
-    x = np.arange(w)[None] - d
-    near = np.clip(np.rint(x).astype(int), 0, w - 1)
-    seen = (np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5)
+    seen = _confirmed(d, theirs[:, ::-1, 0])
     cost = mine[..., 3]
     confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
     if not fill:
         return np.where(seen, d, 0).astype(np.float32), confidence
     return _fill_occlusions(d, seen, images[0]), confidence
+
+
+def _confirmed(d: Map, other: Map) -> NDArray[np.bool_]:
+    """Where the right image's disparity agrees within a pixel with the left one's that points at it."""
+    x = np.arange(d.shape[1])[None] - d
+    near = np.clip(np.rint(x).astype(int), 0, d.shape[1] - 1)
+    return np.asarray((np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5))
 
 
 def polished(d: Map, left: Grey, right: Grey, span: tuple[float, float], config: DepthConfig) -> Map:
@@ -397,9 +400,7 @@ def _network_disparity(
     if fill:
         return d, confidence
     other = network.disparity(views[1][:, ::-1], views[0][:, ::-1], high, low)[0][:, ::-1]
-    x = np.arange(d.shape[1])[None] - d
-    near = np.clip(np.rint(x).astype(int), 0, d.shape[1] - 1)
-    seen = (np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5)
+    seen = _confirmed(d, other)
     return np.where(seen, d, 0).astype(np.float32), np.where(seen, confidence, 0.01).astype(np.float32)
 
 
