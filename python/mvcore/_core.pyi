@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 __all__ = [
     "aggregate",
     "build_atlas",
+    "carve",
     "components",
     "consistency",
     "correlate",
@@ -26,6 +27,7 @@ __all__ = [
     "nurbs_surface",
     "nurbs_surface_grid",
     "nurbs_surface_partials",
+    "photo_carve",
     "rasterize",
     "rate_faces",
     "read_obj",
@@ -89,6 +91,29 @@ def fuse(
     hull_tolerance: float,
     max_memory: int,
 ) -> tuple[_U32, _F32]: ...
+def carve(
+    origin: Sequence[float],
+    voxel: float,
+    shape: Sequence[int],
+    masks: Sequence[_U8],
+    projections: _F64,
+    *,
+    tolerance: float,
+    least_views: int,
+) -> NDArray[np.bool_]: ...
+def photo_carve(
+    origin: Sequence[float],
+    voxel: float,
+    occupied: NDArray[np.bool_],
+    low: Sequence[_U8],
+    high: Sequence[_U8],
+    projections: _F64,
+    centers: Sequence[Sequence[float]],
+    *,
+    threshold: int,
+    least_views: int,
+    rounds: int,
+) -> NDArray[np.bool_]: ...
 def isosurface_dense(values: _F32) -> tuple[_F32, _U32]: ...
 def isosurface_sparse(blocks: Sequence[int], coords: _U32, values: _F32) -> tuple[_F32, _U32]: ...
 def components(faces: _U32) -> _U32: ...

@@ -26,5 +26,7 @@ mod _core {
     #[pymodule_export]
     use crate::texture::{build_atlas, rasterize, rate_faces, select_views, shade};
     #[pymodule_export]
-    use crate::volume::{components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest};
+    use crate::volume::{
+        carve, components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest, photo_carve,
+    };
 }

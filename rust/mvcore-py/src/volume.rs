@@ -1,11 +1,13 @@
 //! Bindings of the consistency, fusion and surface kernels.
 
 use crate::convert::{array, map_of, raster, rasters, run, slice};
+use mvcore::carve::{CarveParams, Silhouette};
 use mvcore::consistency::{ConsistencyParams, OtherView};
 use mvcore::fuse::{FusionParams, FusionView};
 use mvcore::grid::{BlockMap, Grid, SIDE};
 use mvcore::isosurface::Surface;
-use numpy::{PyArray2, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4};
+use mvcore::photo_carve::{Photo, PhotoParams};
+use numpy::{PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4};
 use pyo3::prelude::*;
 
 type Filtered<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<u8>>);
@@ -57,10 +59,9 @@ pub fn fuse<'py>(
     let (depths, weights) = (rasters(&depths, "depths")?, rasters(&weights, "weights")?);
     let silhouettes = silhouettes.as_ref().map(|s| rasters(s, "silhouettes")).transpose()?;
     let n = depths.len();
-    let p = projections.as_array();
-    let fits = p.dim() == (n, 3, 4) && weights.len() == n && silhouettes.as_ref().is_none_or(|s| s.len() == n);
-    if !fits {
-        let text = format!("projections, weights, silhouettes: expected {n} of each, as many as depths");
+    let p = projections_of(&projections, n)?;
+    if weights.len() != n || silhouettes.as_ref().is_some_and(|s| s.len() != n) {
+        let text = format!("weights, silhouettes: expected {n} of each, as many as depths");
         return Err(pyo3::exceptions::PyValueError::new_err(text));
     }
     let views: Vec<FusionView> = (0..n)
@@ -68,8 +69,8 @@ pub fn fuse<'py>(
             depth: depths[v],
             weight: weights[v],
             silhouette: silhouettes.as_ref().map(|s| s[v]),
-            projection: std::array::from_fn(|k| p[(v, k / 4, k % 4)]),
-            focal: (p[(v, 0, 0)].powi(2) + p[(v, 0, 1)].powi(2) + p[(v, 0, 2)].powi(2)).sqrt().max(1e-9),
+            projection: p[v],
+            focal: (p[v][0].powi(2) + p[v][1].powi(2) + p[v][2].powi(2)).sqrt().max(1e-9),
         })
         .collect();
     let params =
@@ -80,6 +81,71 @@ pub fn fuse<'py>(
         array(py, volume.map.coords.into_flattened(), [count, 3])?,
         array(py, volume.values, [count, SIDE, SIDE, SIDE])?,
     ))
+}
+
+#[pyfunction]
+#[pyo3(signature = (origin, voxel, shape, masks, projections, *, tolerance, least_views))]
+pub fn carve<'py>(
+    py: Python<'py>,
+    origin: [f64; 3],
+    voxel: f64,
+    shape: [usize; 3],
+    masks: Vec<PyReadonlyArray2<'py, u8>>,
+    projections: PyReadonlyArray3<'py, f64>,
+    tolerance: f64,
+    least_views: u32,
+) -> PyResult<Bound<'py, PyArray3<bool>>> {
+    let masks = rasters(&masks, "masks")?;
+    let projections = projections_of(&projections, masks.len())?;
+    let views: Vec<Silhouette> =
+        masks.into_iter().zip(projections).map(|(mask, projection)| Silhouette { mask, projection }).collect();
+    let params = CarveParams { tolerance, least_views };
+    let inside = run(py, || mvcore::carve::carve(Grid::new(origin, voxel, shape)?, &views, &params))?;
+    array(py, inside, shape)
+}
+
+/// The volume without the voxels that the photographs contradict.
+#[pyfunction]
+#[pyo3(signature = (origin, voxel, occupied, low, high, projections, centers, *, threshold, least_views, rounds))]
+pub fn photo_carve<'py>(
+    py: Python<'py>,
+    origin: [f64; 3],
+    voxel: f64,
+    occupied: PyReadonlyArray3<'py, bool>,
+    low: Vec<PyReadonlyArray3<'py, u8>>,
+    high: Vec<PyReadonlyArray3<'py, u8>>,
+    projections: PyReadonlyArray3<'py, f64>,
+    centers: Vec<[f64; 3]>,
+    threshold: u8,
+    least_views: usize,
+    rounds: usize,
+) -> PyResult<Bound<'py, PyArray3<bool>>> {
+    let projections = projections_of(&projections, low.len())?;
+    if high.len() != low.len() || centers.len() != low.len() {
+        let text = format!("high, centers: expected {} of each, as many as low", low.len());
+        return Err(pyo3::exceptions::PyValueError::new_err(text));
+    }
+    let photo = |n: usize| {
+        let (height, width, _) = low[n].as_array().dim();
+        let (low, high) = (slice(&low[n], "low")?, slice(&high[n], "high")?);
+        PyResult::Ok(Photo { low, high, width, height, projection: projections[n], center: centers[n] })
+    };
+    let photos = (0..low.len()).map(photo).collect::<PyResult<Vec<_>>>()?;
+    let shape: [usize; 3] = occupied.as_array().dim().into();
+    let mut kept = slice(&occupied, "occupied")?.to_vec();
+    let params = PhotoParams { threshold, least_views, rounds };
+    run(py, || mvcore::photo_carve::photo_carve(Grid::new(origin, voxel, shape)?, &mut kept, &photos, &params))?;
+    array(py, kept, shape)
+}
+
+/// An (n, 3, 4) array as projections.
+fn projections_of(projections: &PyReadonlyArray3<'_, f64>, n: usize) -> PyResult<Vec<[f64; 12]>> {
+    let p = projections.as_array();
+    if p.dim() != (n, 3, 4) {
+        let text = format!("projections: expected shape ({n}, 3, 4), one a view, got {:?}", p.dim());
+        return Err(pyo3::exceptions::PyValueError::new_err(text));
+    }
+    Ok((0..n).map(|v| std::array::from_fn(|k| p[(v, k / 4, k % 4)])).collect())
 }
 
 #[pyfunction]

@@ -7,6 +7,7 @@
 
 pub mod aggregate;
 pub mod atlas;
+pub mod carve;
 pub mod consistency;
 pub mod correlate;
 pub mod cube;
@@ -22,6 +23,7 @@ pub mod nearest;
 pub mod nurbs;
 pub mod pack;
 pub mod patch;
+pub mod photo_carve;
 pub mod raster;
 pub mod rasterize;
 pub mod select_views;
