@@ -19,6 +19,8 @@ ORDER = [
     "network",
     "depth",
     "volume",
+    "carve",
+    "target",
     "surface",
     "texture",
     "result",

@@ -115,6 +115,48 @@ class VolumeConfig:
 
 
 @dataclass(frozen=True)
+class TargetConfig:
+    """Foreground masks of a target in clips."""
+
+    threshold: float = 12.0
+    """Grey levels by which a pixel must differ from the background; three times the measured noise where that is more."""
+    noise: float = 3.0
+    """Grey levels of noise: a weaker pattern is none, and cannot tell a shadow from a thing."""
+    window: int = 7
+    """Pixels a side of the window over which patterns are compared."""
+    correlation: float = 0.5
+    """Correlation of a pattern with the background's above which it is the background in another light."""
+    least_part: float = 0.02
+    """Parts of a mask smaller than this share of the largest are dropped."""
+    cut_rounds: int = 2
+    """Rounds of GrabCut, which brings a mask's border onto the image's edges."""
+    max_size: int = 960
+    """Pixels of the longer side at which masks are found; larger frames are reduced for it."""
+    samples: int = 25
+    """Instants from which a background is learnt where there is no clean plate."""
+    learn_size: int = 480
+    """Pixels of the longer side at which the target's colours are learnt for it."""
+
+
+@dataclass(frozen=True)
+class CarveConfig:
+    """Space carving."""
+
+    resolution: int = 96
+    """Voxels along the longest side where cameras agree on masks: a few pixels each."""
+    tolerance: float = 0.2
+    """Share of the cameras that may not support a voxel there: one of five, as things stand before others."""
+    photo_consistency: bool = False
+    """Whether a hull that no depth map bounds is carved on where its photographs disagree."""
+    threshold: int = 18
+    """Grey levels between two views' colours of a voxel beyond which they contradict each other."""
+    least_views: int = 3
+    """Views that must see a voxel before their colours may remove it."""
+    rounds: int = 8
+    """Most rounds of six sweeps; usually far fewer change anything."""
+
+
+@dataclass(frozen=True)
 class SurfaceConfig:
     """From the field to the mesh."""
 
@@ -157,6 +199,8 @@ class Config:
     sparse: SparseConfig = field(default_factory=SparseConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     volume: VolumeConfig = field(default_factory=VolumeConfig)
+    target: TargetConfig = field(default_factory=TargetConfig)
+    carve: CarveConfig = field(default_factory=CarveConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     texture: TextureConfig = field(default_factory=TextureConfig)
     matcher: str = "sgm"

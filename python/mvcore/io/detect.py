@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..errors import FormatError
 from ..types import Scene
-from . import colmap, idr, middlebury, mvsnet, native, nerf, opencv, strecha
+from . import colmap, easymocap, idr, kalibr, middlebury, mvsnet, native, nerf, opencv, qualisys, strecha
 from .records import Found, to_scene
 
 READERS: tuple[tuple[str, Callable[[Path], Path | None], Callable[[Path], Found]], ...] = (
@@ -18,6 +18,9 @@ READERS: tuple[tuple[str, Callable[[Path], Path | None], Callable[[Path], Found]
     ("IDR / NeuS npz", idr.find, idr.read),
     ("Middlebury par.txt", middlebury.find, middlebury.read),
     ("Strecha .camera", strecha.find, strecha.read),
+    ("Qualisys .qca.txt", qualisys.find, qualisys.read),
+    ("EasyMocap intri.yml and extri.yml", easymocap.find, easymocap.read),
+    ("Kalibr camchain.yaml", kalibr.find, kalibr.read),
     ("OpenCV FileStorage", opencv.find, opencv.read),
 )
 """Name, finder (the path that the reader takes, or None) and reader of each format, the surest first."""

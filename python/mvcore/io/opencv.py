@@ -6,6 +6,8 @@ Of a camera file: ``camera_matrix`` (K), ``distortion_coefficients`` (D), ``rvec
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,15 @@ def read(path: Path) -> Found:
 
 
 def _file(path: Path) -> list[Record]:
+    with open_storage(path) as storage:
+        if not storage.getNode("M1").empty():
+            return _stereo(path, storage)
+        return [_camera(path, storage)]
+
+
+@contextmanager
+def open_storage(path: Path) -> Iterator[cv2.FileStorage]:
+    """A storage to read from; closed at the end."""
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError) as error:
@@ -52,15 +63,18 @@ def _file(path: Path) -> list[Record]:
     try:
         if not storage.isOpened():
             raise FormatError(f"{path}: not an OpenCV FileStorage")
-        if not storage.getNode("M1").empty():
-            return _stereo(path, storage)
-        return [_camera(path, storage)]
+        yield storage
     finally:
         storage.release()
 
 
 def _value(path: Path, storage: cv2.FileStorage, key: str) -> Any:
-    for name in KEYS.get(key, (key,)):
+    return storage_value(path, storage, KEYS.get(key, (key,)))
+
+
+def storage_value(path: Path, storage: cv2.FileStorage, names: Sequence[str]) -> Any:
+    """The text, number or float64 matrix of the first of the names that the storage holds; None where it holds none."""
+    for name in names:
         node = storage.getNode(name)
         if node.empty():
             continue

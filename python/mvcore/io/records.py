@@ -129,6 +129,8 @@ def to_scene(found: Found, need_images: bool = True) -> Scene:
 
 
 def _with_size(record: Record, where: str, need_images: bool) -> Record:
+    if record.width and not need_images:
+        return record
     if record.image is None or not record.image.is_file():
         if need_images:
             raise FormatError(f"{where}: image {str(record.image or record.name)!r} does not exist")

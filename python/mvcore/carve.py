@@ -1,0 +1,252 @@
+"""Space carving: the visual hull of silhouettes, and what photo-consistency takes off it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core
+from .cameras import Camera
+from .config import CarveConfig, VolumeConfig
+from .errors import ReconstructionError, require
+from .types import Bounds, DepthMap, Image, Report
+from .volume import SIDE, Volume, fuse
+
+Mask = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Voxels that are full or empty.
+
+    origin : (3,) world position of voxel (0, 0, 0). voxel : their distance, world units. occupied : (nx, ny, nz) bool.
+    """
+
+    origin: NDArray[np.float64]
+    voxel: float
+    occupied: NDArray[np.bool_]
+
+    def shell(self) -> NDArray[np.float64]:
+        """World positions (n, 3) of the full voxels that have an empty neighbour."""
+        o = self.occupied
+        padded = np.pad(o, 1)
+        inner = np.ones_like(o)
+        for axis in range(3):
+            for step in (0, 2):
+                window = [slice(1, -1)] * 3
+                window[axis] = slice(step, step + o.shape[axis])
+                inner &= padded[tuple(window)]
+        return self.origin + self.voxel * np.argwhere(o & ~inner)
+
+
+def carve_silhouettes(
+    masks: Sequence[Mask],
+    cameras: Sequence[Camera],
+    bounds: Bounds,
+    *,
+    voxel: float | None = None,
+    resolution: int = 128,
+    tolerance: float = 0.04,
+    least_views: int = 2,
+) -> Occupancy:
+    """Voxels inside the visual hull, by the vote of the cameras that see them.
+
+    Parameters
+    ----------
+    masks : (h, w) uint8, non-zero on the target, one a camera. bounds : (2, 3) world.
+    voxel : world units; by default the longest side of the bounds over ``resolution`` - 1.
+    tolerance : share of the cameras that see a voxel and may call it background: one wrong mask among many does no harm.
+    least_views : fewest cameras that must see a voxel.
+
+    Raises
+    ------
+    InvalidInputError
+        Empty bounds, more than 255 masks, or a tolerance outside [0, 1).
+
+    Examples
+    --------
+    >>> camera = Camera(K=[[50, 0, 31.5], [0, 50, 31.5], [0, 0, 1]], R=np.eye(3), t=[0, 0, 4], width=64, height=64)
+    >>> disc = np.zeros((64, 64), np.uint8)
+    >>> disc = cv2.circle(disc, (31, 31), 12, 255, -1)
+    >>> hull = carve_silhouettes([disc, disc], [camera, camera], np.array([[-2.0, -2, -2], [2, 2, 2]]), resolution=33)
+    >>> bool(hull.occupied[16, 16, 16]), bool(hull.occupied[0, 16, 16])
+    (True, False)
+    """
+    bounds = np.asarray(bounds, np.float64)
+    size = bounds[1] - bounds[0]
+    require((size > 0).all(), "bounds", "x0 < x1, y0 < y1, z0 < z1", bounds.tolist())
+    require(len(masks) == len(cameras), "masks", f"{len(cameras)}, one a camera", len(masks))
+    require(resolution >= 2, "resolution", "at least 2", resolution)
+    step = float(voxel if voxel is not None else size.max() / (resolution - 1))
+    shape = [int(n) for n in np.floor(size / step + 1e-9) + 1]
+    inside = _core.carve(
+        bounds[0].tolist(),
+        step,
+        shape,
+        [np.ascontiguousarray(m) for m in masks],
+        np.stack([c.projection for c in cameras]),
+        tolerance=tolerance,
+        least_views=least_views,
+    )
+    return Occupancy(bounds[0], step, inside)
+
+
+def shadow(hull: Occupancy, camera: Camera, grow: float = 1.0) -> Mask:
+    """Pixels whose ray meets a full voxel, (h, w) uint8 of 0 and 255; voxels count ``grow`` times their size."""
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    points = hull.shell()
+    if not len(points):
+        return image
+    z = camera.to_camera(points)[:, 2]
+    points, z = points[z > 0], z[z > 0]
+    x = np.rint(camera.project(points)).astype(np.int64)
+    inside = ((x >= 0) & (x < (camera.width, camera.height))).all(1)
+    image[x[inside, 1], x[inside, 0]] = 255
+    if not inside.any():
+        return image
+    # A cube's diagonal reaches 0.87 of its side to either side.
+    reach = int(np.ceil(0.87 * grow * hull.voxel * camera.K[0, 0] / float(np.quantile(z[inside], 0.1))))
+    return cv2.dilate(image, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)))
+
+
+def _grown(mask: Mask, camera: Camera, bounds: Bounds, voxel: float) -> Mask:
+    """The mask wider by half a voxel's diagonal, so that a voxel counts where any part of it is inside."""
+    depth = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), voxel)
+    reach = int(np.ceil(0.87 * voxel * camera.K[0, 0] / depth))
+    return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)))
+
+
+def tight_box(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Bounds:
+    """Box of the hull inside ``bounds``, twice refined; ``bounds`` where the masks have nothing in common."""
+    box = np.asarray(bounds, np.float64)
+    for _ in range(2):
+        voxel = float((box[1] - box[0]).max()) / (config.resolution - 1)
+        grown = [_grown(m, c, box, voxel) for m, c in zip(masks, cameras, strict=True)]
+        hull = carve_silhouettes(grown, cameras, box, voxel=voxel, tolerance=config.tolerance)
+        full = np.argwhere(hull.occupied)
+        if not len(full):
+            return box
+        box = hull.origin + hull.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
+    return box
+
+
+def supported(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig, tolerance: float) -> list[Mask]:
+    """Per camera the pixels whose rays meet a voxel that the *other* cameras' masks support, (h, w) uint8 of 0 and 255.
+
+    All but the share ``tolerance`` of those that see it must. Foreground elsewhere is noise. All pixels where the others have nothing in common.
+    """
+    box = tight_box(masks, cameras, bounds, config)
+    voxel = float((box[1] - box[0]).max()) / (config.resolution - 1)
+    grown = [_grown(m, c, box, voxel) for m, c in zip(masks, cameras, strict=True)]
+    found = []
+    for n, camera in enumerate(cameras):
+        others = [m for k, m in enumerate(grown) if k != n]
+        theirs = [c for k, c in enumerate(cameras) if k != n]
+        least = min(2, len(others))
+        hull = carve_silhouettes(others, theirs, box, resolution=config.resolution, tolerance=tolerance, least_views=least)
+        seen = shadow(hull, camera, 1.5)
+        found.append(seen if seen.any() else np.full_like(seen, 255))
+    return found
+
+
+def visual_hull(
+    masks: Sequence[Mask],
+    cameras: Sequence[Camera],
+    bounds: Bounds,
+    config: VolumeConfig | None = None,
+    report: Report | None = None,
+) -> Volume:
+    """The visual hull as a signed distance field with a sub-voxel surface (soft silhouettes), block-sparse.
+
+    Parameters and errors as of `mvcore.volume.fuse`.
+    """
+    config = config or VolumeConfig()
+    nothing = [DepthMap(e, e) for e in (np.zeros((c.height, c.width), np.float32) for c in cameras)]
+    return fuse(nothing, cameras, bounds, masks, replace(config, solid_smoothing=config.smoothing), report)
+
+
+def _footprint(image: Image, pixels: float) -> tuple[Image, Image]:
+    """Least and greatest value a channel within about ``pixels`` around each pixel."""
+    side = 2 * max(1, round(0.5 * pixels)) + 1
+    kernel = np.ones((side, side), np.uint8)
+    return np.ascontiguousarray(cv2.erode(image, kernel)), np.ascontiguousarray(cv2.dilate(image, kernel))
+
+
+def photo_hull(
+    hull: Volume,
+    images: Sequence[Image],
+    cameras: Sequence[Camera],
+    config: CarveConfig | None = None,
+    report: Report | None = None,
+) -> Volume:
+    """The hull without what the photographs contradict: the photo hull of Kutulakos and Seitz (IJCV 2000).
+
+    Parameters
+    ----------
+    hull : of `visual_hull`. images : (h, w, 3) uint8, undistorted and of like exposure, one a camera.
+
+    Raises
+    ------
+    ReconstructionError
+        Nothing is left: the photographs contradict each other everywhere.
+    """
+    config, report = config or CarveConfig(), report or Report()
+    field = dense(hull, 1.0)
+    middle = hull.origin + 0.5 * hull.voxel * np.array(field.shape)
+    sides = [hull.voxel * c.K[0, 0] / max(float(c.to_camera(middle[None])[0, 2]), 1e-9) for c in cameras]
+    low, high = zip(*(_footprint(i, s) for i, s in zip(images, sides, strict=True)), strict=True)
+    kept = _core.photo_carve(
+        hull.origin.tolist(),
+        hull.voxel,
+        np.ascontiguousarray(field < 0),
+        low,
+        high,
+        np.stack([c.projection for c in cameras]),
+        [c.center.tolist() for c in cameras],
+        threshold=config.threshold,
+        least_views=config.least_views,
+        rounds=config.rounds,
+    )
+    report.values["photo_carving"] = {"voxels": int((field < 0).sum()), "cleared": int((field < 0).sum() - kept.sum())}
+    if not kept.any():
+        raise ReconstructionError("photo-consistency carves everything away: the photographs' colours or poses do not agree")
+    # Where nothing was carved the hull's own surface is the better one.
+    smooth = _smoothed(np.where(kept, -1.0, 1.0).astype(np.float32))
+    return sparse_volume(np.maximum(field, smooth), hull.origin, hull.voxel)
+
+
+def _smoothed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Binomial mean over 5 voxels along each axis: a surface between full and empty voxels that is no staircase."""
+    for axis in range(3):
+        padded = np.pad(values, [(2, 2) if a == axis else (0, 0) for a in range(3)], mode="edge")
+        n = values.shape[axis]
+        parts = [np.take(padded, range(k, k + n), axis) for k in range(5)]
+        values = ((parts[0] + parts[4]) + 4 * (parts[1] + parts[3]) + 6 * parts[2]) / 16
+    return values
+
+
+def dense(volume: Volume, beyond: float) -> NDArray[np.float32]:
+    """All samples of a block-sparse field, (nx, ny, nz), ``beyond`` where no block is."""
+    bx, by, bz = volume.blocks
+    blocks = np.full((bx, by, bz, SIDE, SIDE, SIDE), beyond, np.float32)
+    i, j, k = volume.coords.T
+    blocks[i, j, k] = volume.values
+    whole = blocks.transpose(0, 3, 1, 4, 2, 5).reshape(bx * SIDE, by * SIDE, bz * SIDE)
+    nx, ny, nz = volume.shape
+    return np.ascontiguousarray(whole[:nx, :ny, :nz])
+
+
+def sparse_volume(field: NDArray[np.float32], origin: NDArray[np.float64], voxel: float) -> Volume:
+    """A dense field of -1 .. 1 in blocks; those that are 1 throughout are left out."""
+    nx, ny, nz = field.shape
+    pad = [(0, -n % SIDE) for n in field.shape]
+    whole = np.pad(field, pad, constant_values=1.0)
+    bx, by, bz = (n // SIDE for n in whole.shape)
+    blocks = whole.reshape(bx, SIDE, by, SIDE, bz, SIDE).transpose(0, 2, 4, 1, 3, 5)
+    used = np.argwhere((blocks < 1).any((3, 4, 5)))
+    values = np.ascontiguousarray(blocks[used[:, 0], used[:, 1], used[:, 2]], np.float32)
+    return Volume(np.asarray(origin, np.float64), voxel, (nx, ny, nz), used.astype(np.uint32), values)

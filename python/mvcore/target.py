@@ -1,0 +1,287 @@
+"""The target in clips: foreground masks from clean plates or from a background learnt over the clip, agreed on by the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .cameras import Camera
+from .carve import supported
+from .config import CarveConfig, TargetConfig
+from .errors import require
+from .io.images import reduce
+from .types import Bounds, Image, Track, no_track
+
+Mask = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Background:
+    """What a camera sees without the target.
+
+    plate : (h, w, 3) uint8. known : (h, w) bool, where the plate is sure. region : (h, w) bool, where the target may appear at all.
+    learnt : the plate comes from the clip and may show parts of the target that never move.
+    """
+
+    plate: Image
+    known: Bool
+    region: Bool
+    learnt: bool = False
+
+    @classmethod
+    def from_plate(cls, plate: Image, road: Mask | None = None) -> Background:
+        """From a clean plate; ``road`` (non-zero where targets may be) is a region of interest."""
+        everywhere = np.ones(plate.shape[:2], bool)
+        return cls(plate, everywhere, everywhere if road is None else road > 0)
+
+
+def _disc(side: int) -> Mask:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+
+
+def _local(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    return np.asarray(cv2.blur(values, (side, side)), np.float32)
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Per pixel: foreground, surely background."""
+
+    changed: Bool
+    background: Bool
+
+
+def _evidence(image: Image, background: Background, config: TargetConfig) -> _Evidence:
+    """Compares a frame with the plate; light and shadow change a surface's brightness but not its pattern.
+
+    Where the plate or the frame has a pattern, correlation of logarithms over a window tells a shadow from a thing; elsewhere the usual
+    test on brightness and hue does.
+    """
+    now, plate = image.astype(np.float32), background.plate.astype(np.float32)
+    difference = cv2.GaussianBlur(np.abs(now - plate).max(2), (0, 0), 1.0)
+    # The quietest quarter of the picture is surely background: about one standard deviation of its noise.
+    noise = float(np.quantile(difference[background.known], 0.25)) if background.known.any() else 0.0
+    least = max(config.threshold, 3 * noise)
+    ratio = (_local(now, 5) + 4) / (_local(plate, 5) + 4)
+    brightness = ratio.mean(2)
+    hue = np.abs(ratio - brightness[..., None]).max(2) / brightness
+    side = config.window
+    logs = [np.log(v.mean(2) + 8) for v in (now, plate)]
+    means = [_local(v, side) for v in logs]
+    spread = [np.maximum(_local(v * v, side) - m * m, 0) for v, m in zip(logs, means, strict=True)]
+    common = _local(logs[0] * logs[1], side) - means[0] * means[1]
+    correlation = common / np.sqrt(spread[0] * spread[1] + 1e-12)
+    # Grey levels of noise are a share of the brightness.
+    patterned = np.zeros(correlation.shape, bool)
+    for s, m in zip(spread, means, strict=True):
+        patterned |= s > 4 * (config.noise / np.exp(m)) ** 2
+    lit = (brightness > 0.12) & (brightness < 1.3) & (hue < 0.35)
+    plain = (brightness > 0.3) & (brightness < 1.08) & (hue < 0.12)
+    relit = lit & np.where(patterned, correlation > config.correlation, plain)
+    unchanged = difference < 0.5 * least
+    sure = unchanged | (relit & (correlation > 0.75))
+    return _Evidence(
+        ((difference > least) & ~relit | ~background.known) & background.region, sure & background.known | ~background.region
+    )
+
+
+def _cleaned(mask: Mask, config: TargetConfig) -> Mask:
+    """Without specks, closed, parts of some size only."""
+    mask = cv2.morphologyEx(cv2.medianBlur(mask, 5), cv2.MORPH_OPEN, _disc(3))
+    return _large(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(9)), config.least_part)
+
+
+def _large(mask: Mask, share: float) -> Mask:
+    """The parts that have at least ``share`` of the largest part's pixels."""
+    count, part, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count <= 1:
+        return mask
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    return (area >= max(16, share * area.max()))[part].astype(np.uint8)
+
+
+def _cut(image: Image, rough: Mask, background: Bool, doubtful: Bool | None, rounds: int) -> Mask:
+    """GrabCut around a rough mask (0 and 1): its border settles on the image's edges; colours decide what is ``doubtful``."""
+    if not rough.any():
+        return rough
+    y, x = np.nonzero(rough if doubtful is None else rough | doubtful)
+    pad = 24
+    window = np.s_[max(0, y.min() - pad) : y.max() + pad, max(0, x.min() - pad) : x.max() + pad]
+    inner, near = cv2.erode(rough, _disc(9)), cv2.dilate(rough, _disc(13))
+    labels = np.where(rough > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[background | (near == 0)] = cv2.GC_BGD
+    labels[inner > 0] = cv2.GC_FGD
+    if doubtful is not None:
+        labels[doubtful & (rough == 0)] = cv2.GC_PR_FGD
+    labels = np.ascontiguousarray(labels[window])
+    # Colour models need both kinds.
+    if not ((labels & 1) == 0).any() or not ((labels & 1) == 1).any():
+        return rough
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.setRNGSeed(0)  # its k-means: the same mask each time
+    cv2.grabCut(np.ascontiguousarray(image[window]), labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    out = np.zeros_like(rough)
+    out[window] = labels & 1
+    return out
+
+
+def _at(background: Background, size: tuple[int, int]) -> Background:
+    if background.plate.shape[1::-1] == size:
+        return background
+    known, region = (
+        cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for m in (background.known, background.region)
+    )
+    return Background(cv2.resize(background.plate, size, interpolation=cv2.INTER_AREA), known, region, background.learnt)
+
+
+def foreground(
+    images: Sequence[Image],
+    cameras: Sequence[Camera],
+    backgrounds: Sequence[Background],
+    bounds: Bounds | None = None,
+    config: TargetConfig | None = None,
+    carving: CarveConfig | None = None,
+) -> list[Mask]:
+    """The target's masks at one instant.
+
+    Parameters
+    ----------
+    images : undistorted (h, w, 3) uint8, one a camera, with its background.
+    bounds : (2, 3) world: where targets are; foreground whose ray meets nothing there that the other cameras support is noise.
+
+    Returns
+    -------
+    (h, w) uint8 of 0 and 255, one a camera.
+    """
+    config, carving = config or TargetConfig(), carving or CarveConfig()
+    require(len(images) == len(cameras) == len(backgrounds), "backgrounds", f"{len(images)}, one an image", len(backgrounds))
+    small, reduced, found = [], [], []
+    for n, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        picture, at = reduce(image, camera, config.max_size)
+        small.append(picture)
+        reduced.append(at)
+        found.append(_evidence(picture, _at(backgrounds[n], (at.width, at.height)), config))
+    rough = [_cleaned(e.changed.astype(np.uint8), config) for e in found]
+    outside = [e.background for e in found]
+    doubtful: list[Bool | None] = [None] * len(images)
+    if bounds is not None and len(images) > 2:
+        # Masks grow a little first: what one camera misses by a pixel must not cost the others theirs.
+        grown = [cv2.dilate(r, _disc(7)) for r in rough]
+        learnt = any(b.learnt for b in backgrounds)
+        # A learnt plate may show a part of the target in one camera; the others must not lose it for that.
+        one = max(carving.tolerance, 1.01 / (len(images) - 1)) if learnt else carving.tolerance
+        seen = supported(grown, reduced, bounds, carving, one)
+        if learnt:  # and where all the others agree, that camera's colours decide
+            agreed = [s > 0 for s in supported(grown, reduced, bounds, carving, 0.0)]
+            doubtful = [a & b.learnt for a, b in zip(agreed, backgrounds, strict=True)]
+            outside = [o & ~a for o, a in zip(outside, agreed, strict=True)]
+        rough = [_large(r & (s > 0), config.least_part) for r, s in zip(rough, seen, strict=True)]
+        outside = [o | (s == 0) for o, s in zip(outside, seen, strict=True)]
+    masks = []
+    for picture, r, o, d, image in zip(small, rough, outside, doubtful, images, strict=True):
+        mask = _large(_cut(picture, r, o, d, config.cut_rounds), config.least_part) * np.uint8(255)
+        h, w = image.shape[:2]
+        if mask.shape != (h, w):
+            mask = np.where(cv2.resize(mask, (w, h), interpolation=cv2.INTER_LINEAR) > 127, 255, 0).astype(np.uint8)
+        masks.append(mask)
+    return masks
+
+
+def learn_backgrounds(
+    frames: Sequence[Sequence[Image]],
+    cameras: Sequence[Camera],
+    config: TargetConfig | None = None,
+    track: Track = no_track,
+) -> list[Background]:
+    """What stands behind a moving target, from samples of the clip without a clean plate.
+
+    The plate is each pixel's most frequent colour. Where the target stays for most of the clip, that is the target itself: colours
+    learnt from what moves (GrabCut's mixtures) tell these places, which become unknown and count as target. OpenCV's MOG2 has a say
+    in what moves; it drops shadows.
+
+    Parameters
+    ----------
+    frames : (cameras, samples): undistorted (h, w, 3) uint8, spread over the clip.
+
+    Returns
+    -------
+    One a camera, with the longer side at most ``config.max_size`` pixels.
+    """
+    config = config or TargetConfig()
+    require(all(len(f) >= 3 for f in frames), "frames", "at least 3 samples a camera", min(map(len, frames)))
+    found = []
+    for samples, camera in track(zip(frames, cameras, strict=True), "background", len(cameras)):
+        large = np.stack([reduce(f, camera, config.max_size)[0] for f in samples])
+        small = np.stack([reduce(f, camera, config.learn_size)[0] for f in samples])
+        region = _moving(small, config)
+        ghost = _ghost(small, _commonest(small, config), region, config)
+        h, w = large.shape[1:3]
+        known, around = (cv2.resize(m, (w, h), interpolation=cv2.INTER_NEAREST) for m in (1 - ghost, _widened(region)))
+        found.append(Background(_commonest(large, config), known > 0, around > 0, learnt=True))
+    return found
+
+
+def _commonest(samples: NDArray[np.uint8], config: TargetConfig) -> Image:
+    """The colour of each pixel that the most samples are near to: their mean."""
+    plate = np.empty(samples.shape[1:], np.uint8)
+    for y in range(len(plate)):  # a row at a time: all pairs of samples would be large
+        row = samples[:, y].astype(np.int16)
+        near = np.abs(row[:, None] - row[None]).max(-1) < config.threshold
+        best = near.sum(1).argmax(0)
+        mine = np.take_along_axis(near, best[None, None], 0)[0]
+        plate[y] = np.rint((row * mine[..., None]).sum(0) / mine.sum(0)[:, None])
+    return plate
+
+
+def _moving(samples: NDArray[np.uint8], config: TargetConfig) -> Mask:
+    """Where the target is at some time: what changes over the samples, closed and filled; 0 and 1."""
+    smooth = np.stack([cv2.GaussianBlur(s, (0, 0), 1.2) for s in samples])
+    low, high = np.quantile(smooth, [0.04, 0.96], axis=0)
+    mog = cv2.createBackgroundSubtractorMOG2(history=len(samples), detectShadows=True)
+    for s in smooth:
+        mog.apply(s)
+    often = sum((mog.apply(s, learningRate=0) == 255).astype(int) for s in smooth)
+    changes = ((high - low).max(-1) > 1.8 * config.threshold) | (often > 0.1 * len(samples))
+    region = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_OPEN, _disc(3))
+    region = _large(cv2.morphologyEx(region, cv2.MORPH_CLOSE, _disc(21)), 0.1)
+    outer = np.pad(region, 1)
+    cv2.floodFill(outer, None, (0, 0), 2)
+    return cv2.dilate((outer[1:-1, 1:-1] != 2).astype(np.uint8), _disc(5))
+
+
+def _widened(region: Mask) -> Mask:
+    """The region with what adjoins it: parts of a target may stand still."""
+    return cv2.dilate(region, _disc(2 * round(0.03 * max(region.shape)) + 1))
+
+
+def _ghost(samples: NDArray[np.uint8], plate: Image, region: Mask, config: TargetConfig) -> Mask:
+    """Where the plate shows the target, 0 and 1: by the colours of what differs from it in the samples."""
+    wide = _widened(region)
+    chosen = samples[:: max(1, len(samples) // GHOST_SAMPLES)]
+    frames, labels = [], []
+    for sample in chosen:
+        difference = cv2.GaussianBlur(cv2.absdiff(sample, plate).max(2), (0, 0), 0.8)
+        label = np.where(wide > 0, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
+        label[(region > 0) & (difference > 2.5 * config.threshold)] = cv2.GC_PR_FGD
+        frames.append(sample)
+        labels.append(label)
+    together = np.concatenate(labels)
+    if not (together & 1).any() or (together & 1).all():
+        return np.zeros_like(region)
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.setRNGSeed(0)
+    # One image of all samples has one mixture a kind; a single round, as more of them drift from what was seen to move.
+    cv2.grabCut(np.concatenate(frames), together, None, *models, 1, cv2.GC_INIT_WITH_MASK)
+    label = np.where(wide > 0, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
+    cv2.grabCut(plate, label, None, *models, 1, cv2.GC_EVAL_FREEZE_MODEL)
+    return cv2.dilate(label & 1, _disc(5))
+
+
+GHOST_SAMPLES = 10
+"""Samples from which the target's colours are learnt."""
