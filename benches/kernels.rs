@@ -240,7 +240,7 @@ fn meshes(c: &mut Criterion) {
     group.bench_function("build_atlas, 8 views", |b| b.iter(|| build_atlas(mesh, &labels, &sources, 8192).unwrap()));
     group.throughput(Throughput::Elements(vertices.len() as u64));
     let shifted: Vec<[f64; 3]> = vertices.iter().map(|v| v.map(|x| x * 1.01)).collect();
-    group.bench_function("nearest", |b| b.iter(|| nearest(&shifted, &vertices).unwrap()));
+    group.bench_function("nearest", |b| b.iter(|| nearest(&shifted, &vertices, f64::INFINITY).unwrap()));
     group.finish();
 }
 

@@ -11,6 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "python" / "mvcore"
 ORDER = [
     "errors",
+    "store",
     "cameras",
     "types",
     "config",
@@ -26,7 +27,11 @@ ORDER = [
     "result",
     "metrics",
     "nurbs",
+    "motion",
     "pipeline",
+    "schedule",
+    "video",
+    "viewer",
     "cli",
 ]
 

@@ -15,17 +15,20 @@ from .types import DepthMap, Scene, SparsePoints
 
 if TYPE_CHECKING:
     from .depth import disparity
-    from .io import load, save_calibration
+    from .io import load, load_video, save_calibration
     from .pipeline import reconstruct
     from .result import Reconstruction
+    from .video import reconstruct_video
 
 __version__ = _version("mvcore")
 
 _LATER = {
     "disparity": "depth",
     "load": "io",
+    "load_video": "io",
     "save_calibration": "io",
     "reconstruct": "pipeline",
+    "reconstruct_video": "video",
     "Reconstruction": "result",
 }
 """Names that bring OpenCV with them: imported when they are first used."""
@@ -44,7 +47,9 @@ __all__ = [
     "SparsePoints",
     "disparity",
     "load",
+    "load_video",
     "reconstruct",
+    "reconstruct_video",
     "save_calibration",
 ]
 

@@ -177,6 +177,16 @@ class Camera:
         scale = np.array([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1]])
         return replace(self, K=scale @ self.K, width=width, height=height)
 
+    def cropped(self, x: int, y: int, width: int, height: int) -> Camera:
+        """The view of a window of the image whose top-left pixel is (x, y)."""
+        shift = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+        return replace(self, K=shift @ self.K, width=width, height=height)
+
+    def moved(self, pose: ArrayLike) -> Camera:
+        """The view as seen from a frame that ``pose`` (4, 4) brings into the world: X_world = pose X."""
+        m = _matrix("pose", pose, (4, 4))
+        return replace(self, R=self.R @ m[:3, :3], t=self.R @ m[:3, 3] + self.t)
+
     def pinhole(self) -> Camera:
         """The same view without distortion, as its undistorted image shows it."""
         return replace(self, distortion=np.zeros(0), fisheye=False)

@@ -176,6 +176,8 @@ class TextureConfig:
     """Cost of a seam along one edge against the best and the worst view of a face (1)."""
     outlier: float = 60.0
     """Grey levels by which a view may differ from the median of all: beyond, it shows an occluder or a highlight."""
+    loyalty: float = 0.5
+    """Share by which a face's photograph at the instant before counts as better: it changes only where another is clearly better."""
     least_patch: int = 32
     """Faces below which a patch takes its neighbour's view."""
     mask_erosion: int = 3
@@ -184,6 +186,28 @@ class TextureConfig:
     """Texels a side of the atlas; photographs are reduced until it fits."""
     padding_depth: float = 2.0
     """Voxels by which a vertex may lie behind the z-buffer and still count as seen."""
+
+
+@dataclass(frozen=True)
+class VideoConfig:
+    """Clips: what instants share."""
+
+    segment: int = 8
+    """Instants of a chain: its first is searched in full, each later one starts from the surface before it."""
+    chains: int = 2
+    """Chains that are worked on at a time."""
+    margin: float = 0.06
+    """Share of a target's silhouette box added around it before the frames are cropped."""
+    stereo_angle: float = 40.0
+    """Degrees between a view and its nearest neighbour, in the median, beyond which stereo cannot work and the hull is the result."""
+    doubt: float = 0.5
+    """1 - ZNCC above which a pixel started from the surface before it is in doubt."""
+    least_target: float = 0.1
+    """Parts of the hull with a smaller share of the largest part's volume are no targets."""
+    registration_points: int = 30_000
+    """Points an instant for the poses of a rigid target."""
+    registration_rounds: int = 40
+    """Rounds of their joint refinement."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +227,7 @@ class Config:
     carve: CarveConfig = field(default_factory=CarveConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     texture: TextureConfig = field(default_factory=TextureConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
     matcher: str = "sgm"
     """The depth matcher: ``sgm`` is the classical one, ``dcnn`` the network; the default measured better on exact truth."""
     device: str = "cpu"

@@ -8,7 +8,7 @@ homographies.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -182,6 +182,17 @@ class RoughDepth:
 
     hypotheses: _Hypotheses
 
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """All of it by name, to be stored."""
+        h = self.hypotheses
+        return {"planes": h.planes, "prior": h.prior, "margin": h.margin, "search": np.array([*h.span, h.step], np.float64)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.float32]]) -> RoughDepth:
+        """What `arrays` gave."""
+        low, high, step = map(float, arrays["search"])
+        return cls(_Hypotheses(arrays["planes"], arrays["prior"], arrays["margin"], (low, high), step))
+
     @property
     def depth(self) -> Map:
         """z-depth, (h, w) float32, 0 = none."""
@@ -209,6 +220,54 @@ def sweep_depth(reference: View, sources: Sequence[View], near: float, far: floa
     for scale in finer[:-1]:
         found = _finer(found, scale, config.rounds, config)
     return RoughDepth(found)
+
+
+def seeded_depth(
+    reference: View,
+    sources: Sequence[View],
+    near: float,
+    far: float,
+    seed: Map,
+    config: DepthConfig | None = None,
+    doubt: float = 0.5,
+) -> RoughDepth:
+    """First pass that starts from a depth map expected here, an earlier instant's surface say, instead of sweeping.
+
+    Where more than a tenth of the seeded pixels correlate worse than ``1 - doubt``, the view is swept as well, and each pixel takes the
+    better of the two. Parameters and errors as of `sweep_depth`.
+
+    Parameters
+    ----------
+    seed : (h, w) float32 z-depth, 0 where nothing is expected.
+    """
+    config = config or DepthConfig()
+    _check(sources, near, far)
+    require(seed.shape == reference.grey.shape, "seed", f"shape {reference.grey.shape}", seed.shape)
+    coarsest, *finer = _pyramid(reference, sources, config)
+    h, w = coarsest.greys[0].shape
+    start = cv2.resize(seed, (w, h), interpolation=cv2.INTER_NEAREST)
+    expected = start > 0
+    if not expected.any():
+        return sweep_depth(reference, sources, near, far, config)
+    inverse = np.clip(1 / _filled(start), 1 / far, 1 / near).astype(np.float32)
+    span, step = (1 / far, 1 / near), (1 / near - 1 / far) / (config.planes - 1)
+    found = _around(coarsest, inverse, np.full((h, w), 0.25, np.float32), span, step, config)
+    if (found.planes[..., 3][expected] > doubt).mean() > 0.1:
+        swept = _sweep(coarsest, *span, config.planes, config)
+        better = swept.planes[..., 3] < found.planes[..., 3]
+        merged = [np.where(better, a, b) for a, b in ((swept.prior, found.prior), (swept.margin, found.margin))]
+        found = replace(swept, planes=np.where(better[..., None], swept.planes, found.planes), prior=merged[0], margin=merged[1])
+    for scale in finer[:-1]:
+        found = _finer(found, scale, config.rounds, config)
+    return RoughDepth(found)
+
+
+def _filled(depth: Map) -> Map:
+    """The nearest known depth where none is."""
+    _, label = cv2.distanceTransformWithLabels((depth <= 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    known = np.zeros(int(label.max()) + 1, np.float32)
+    known[label[depth > 0]] = depth[depth > 0]
+    return known[label]
 
 
 NETWORK_SIDE = 768

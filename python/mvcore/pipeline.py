@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import depth as depth_stage
 from . import sparse as sparse_stage
 from .cameras import Calibration, Camera
+from .carve import photo_hull, visual_hull
 from .config import Config, DepthConfig
 from .depth import View
 from .errors import ReconstructionError, require
@@ -25,9 +26,9 @@ from .io import load
 from .io.images import find_masks, load_frame, load_mask, reduce, undistort
 from .result import Reconstruction
 from .surface import extract_surface
-from .texture import texture
+from .texture import Given, texture
 from .types import Bounds, DepthMap, Frame, Image, Report, SparsePoints, Track, no_track
-from .volume import fuse
+from .volume import Volume, fuse
 
 Masks = list[NDArray[np.uint8]]
 
@@ -57,7 +58,8 @@ def _calibration(calib: Calibration | Sequence[Camera] | str | Path) -> Calibrat
     return calib if isinstance(calib, Calibration) else Calibration(tuple(calib))
 
 
-def _bounds(bounds: ArrayLike | None) -> Bounds | None:
+def check_bounds(bounds: ArrayLike | None) -> Bounds | None:
+    """A caller's box as (2, 3), checked."""
     if bounds is None:
         return None
     box = np.asarray(bounds, np.float64)
@@ -119,50 +121,131 @@ def reconstruct(
     calib = _calibration(calib)
     require(len(frames) == len(calib), "frames", f"{len(calib)}, one a camera", len(frames))
     calib.check_baselines()
-    given = _bounds(bounds)
+    given = check_bounds(bounds)
     if isinstance(masks, str | Path):
         masks = find_masks(masks, frames)
     require(masks is None or len(masks) == len(frames), "masks", f"{len(frames)}, one a frame", len(masks or ()))
     report = Report()
     report.values |= {"views": len(frames), "matcher": config.matcher, "config": asdict(config)}
     clock = _Clock(report)
-
     with clock.stage("io"):
         images, cut, cameras = _inputs(frames, calib, masks, config.depth.max_image_size, track)
+    views = Views(images, cut, cameras)
     with clock.stage("sparse"):
-        points = sparse_stage.find_points(images, cameras, cut, config.sparse, report, track)
-        box = given if given is not None else _target(cameras, points, cut)
-        # Masks show the target alone: its box bounds the search as given bounds do.
-        bounded = given is not None or cut is not None
-        ranges = sparse_stage.depth_ranges(cameras, points, box, config.sparse.range_stretch, bounded)
-        scores = sparse_stage.view_scores(cameras, points, box, config.depth)
-        sources = sparse_stage.choose_sources(scores, config.depth.sources)
-    _say_left_out(sources, cameras, report)
+        plan = make_plan(views, given, config, report, track)
     with clock.stage("depth"):
-        depths = _depths(images, cameras, sources, ranges, config, track)
+        depths = _depths(views, plan, config, track)
+    result = build(views, plan, depths, config, report, track, clock)
+    result.cameras = Calibration(tuple(cameras), calib.source)
+    result.report["peak_memory_mib"] = round(_peak_memory() / 2**20)
+    return result
+
+
+@dataclass(frozen=True)
+class Views:
+    """Undistorted images of one instant, their masks (or None) and their cameras."""
+
+    images: list[Image]
+    masks: Masks | None
+    cameras: list[Camera]
+
+    def view(self, n: int) -> View:
+        """View ``n`` as the depth stage takes it."""
+        return View(cv2.cvtColor(self.images[n], cv2.COLOR_RGB2GRAY), self.cameras[n], self.images[n])
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where to search: sparse points, the target's box, the views' depth ranges and their source views, best first."""
+
+    points: SparsePoints
+    box: Bounds
+    ranges: list[tuple[float, float]]
+    sources: list[list[int]]
+
+
+def make_plan(views: Views, given: Bounds | None, config: Config, report: Report, track: Track = no_track) -> Plan:
+    """Sparse points, and the search that they and the bounds allow.
+
+    Raises
+    ------
+    ReconstructionError
+        The calibration does not fit the images, or no two views see the same surface.
+    """
+    cameras, masks = views.cameras, views.masks
+    points = sparse_stage.find_points(views.images, cameras, masks, config.sparse, report, track)
+    box = given if given is not None else _target(cameras, points, masks)
+    # Masks show the target alone: its box bounds the search as given bounds do.
+    bounded = given is not None or masks is not None
+    ranges = sparse_stage.depth_ranges(cameras, points, box, config.sparse.range_stretch, bounded)
+    scores = sparse_stage.view_scores(cameras, points, box, config.depth)
+    sources = sparse_stage.choose_sources(scores, config.depth.sources)
+    _say_left_out(sources, cameras, report)
+    return Plan(points, box, ranges, sources)
+
+
+def build(
+    views: Views,
+    plan: Plan,
+    depths: list[DepthMap | None],
+    config: Config,
+    report: Report,
+    track: Track = no_track,
+    clock: _Clock | None = None,
+    given: Given | None = None,
+) -> Reconstruction:
+    """From depth maps (None where a view has none) to the textured mesh; ``given`` is what an earlier instant settled."""
+    clock = clock or _Clock(Report())
     with clock.stage("consistency"):
-        filtered = _filtered(depths, cameras, sources, cut, config.depth, track)
-        fused = _filtered(depths, cameras, sources, cut, config.depth.loosened(), track)
-        _say_kept(filtered, sources, cut is not None, report)
+        filtered = filter_views(views, plan, depths, config.depth, track)
+        fused = filter_views(views, plan, depths, config.depth.loosened(), track)
+        _say_kept(filtered, plan.sources, views.masks is not None, report)
     with clock.stage("volume"):
-        views = [d if d is not None else _nothing(c) for d, c in zip(fused, cameras, strict=True)]
-        volume = fuse(views, cameras, box, cut, config.volume, report)
+        volume = fuse_views(views, plan, fused, config, report)
+    return finish(views, plan, filtered, volume, config, report, track, clock, given)
+
+
+def fuse_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: Config, report: Report) -> Volume:
+    """The signed distance field of filtered depth maps; that of the visual hull where no view has sources but masks are given."""
+    if not any(plan.sources) and views.masks is not None:
+        hull = visual_hull(views.masks, views.cameras, plan.box, config.volume, report)
+        return photo_hull(hull, views.images, views.cameras, config.carve, report) if config.carve.photo_consistency else hull
+    maps = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)]
+    return fuse(maps, views.cameras, plan.box, views.masks, config.volume, report)
+
+
+def finish(
+    views: Views,
+    plan: Plan,
+    filtered: list[DepthMap | None],
+    volume: Volume,
+    config: Config,
+    report: Report,
+    track: Track = no_track,
+    clock: _Clock | None = None,
+    given: Given | None = None,
+) -> Reconstruction:
+    """From the field to the textured mesh."""
+    clock = clock or _Clock(Report())
     with clock.stage("surface"):
-        surface = extract_surface(volume, config.surface, solid=cut is not None)
+        surface = extract_surface(volume, config.surface, solid=views.masks is not None)
     with clock.stage("texture"):
-        textured = texture(surface, images, cameras, cut, volume.voxel, config.texture, report, track)
+        textured = texture(
+            surface, views.images, views.cameras, views.masks, volume.voxel, config.texture, report, track, given or Given()
+        )
     report.values["mesh"] = {"vertices": len(textured.vertices), "faces": len(textured.faces)}
-    report.values["peak_memory_mib"] = round(_peak_memory() / 2**20)
-    report.values["bounds"] = box.tolist()
+    report.values["texture"]["gains"] = textured.gains.tolist()
+    report.values["bounds"] = plan.box.tolist()
     return Reconstruction(
         vertices=textured.vertices,
         faces=textured.faces,
         uv=textured.uv,
         texture=textured.atlas,
         depths=filtered,
-        cameras=Calibration(tuple(cameras), calib.source),
-        sparse=points,
-        bounds=box,
+        cameras=Calibration(tuple(views.cameras)),
+        sparse=plan.points,
+        bounds=plan.box,
+        face_views=textured.view,
         report=report.values | {"warnings": report.warnings},
     )
 
@@ -184,27 +267,26 @@ def _say_left_out(sources: list[list[int]], cameras: Sequence[Camera], report: R
         report.warn(f"view {n} ({cameras[n].name or 'unnamed'}) is left out: no other view sees its surface from a near enough angle")
 
 
-def _depths(
-    images: Sequence[Image],
-    cameras: Sequence[Camera],
-    sources: list[list[int]],
-    ranges: list[tuple[float, float]],
-    config: Config,
-    track: Track,
-) -> list[DepthMap | None]:
-    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
-    used = [n for n, s in enumerate(sources) if s]
-    rough: dict[int, depth_stage.RoughDepth] = {}
-    for n in track(used, "depth, first pass", len(used)):
-        others = [views[j] for j in sources[n]]
-        if config.matcher == "dcnn":
-            rough[n] = depth_stage.network_depth(views[n], others, *ranges[n], config.depth, config.device)
-        else:
-            rough[n] = depth_stage.sweep_depth(views[n], others, *ranges[n], config.depth)
-    depths: list[DepthMap | None] = [None] * len(views)
+def first_pass(views: Views, plan: Plan, n: int, config: Config) -> depth_stage.RoughDepth:
+    """View ``n``'s depth from photographs alone."""
+    reference, others = views.view(n), [views.view(j) for j in plan.sources[n]]
+    if config.matcher == "dcnn":
+        return depth_stage.network_depth(reference, others, *plan.ranges[n], config.depth, config.device)
+    return depth_stage.sweep_depth(reference, others, *plan.ranges[n], config.depth)
+
+
+def second_pass(views: Views, plan: Plan, n: int, rough: Mapping[int, depth_stage.RoughDepth], config: Config) -> DepthMap:
+    """View ``n``'s depth with its sources' first passes as witnesses."""
+    near = [j for j in plan.sources[n] if j in rough]
+    return depth_stage.refine_depth(views.view(n), [views.view(j) for j in near], rough[n], [rough[j] for j in near], config.depth)
+
+
+def _depths(views: Views, plan: Plan, config: Config, track: Track) -> list[DepthMap | None]:
+    used = [n for n, s in enumerate(plan.sources) if s]
+    rough = {n: first_pass(views, plan, n, config) for n in track(used, "depth, first pass", len(used))}
+    depths: list[DepthMap | None] = [None] * len(views.images)
     for n in track(used, "depth, second pass", len(used)):
-        near = [j for j in sources[n] if j in rough]
-        depths[n] = depth_stage.refine_depth(views[n], [views[j] for j in near], rough[n], [rough[j] for j in near], config.depth)
+        depths[n] = second_pass(views, plan, n, rough, config)
     return depths
 
 
@@ -213,24 +295,17 @@ def _nothing(camera: Camera) -> DepthMap:
     return DepthMap(empty, empty)
 
 
-def _filtered(
-    depths: list[DepthMap | None],
-    cameras: Sequence[Camera],
-    sources: list[list[int]],
-    masks: Masks | None,
-    config: DepthConfig,
-    track: Track,
-) -> list[DepthMap | None]:
+def filter_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: DepthConfig, track: Track = no_track) -> list[DepthMap | None]:
     """What other views agree with, inside the masks."""
-    known = [d if d is not None else _nothing(c) for d, c in zip(depths, cameras, strict=True)]
+    known = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)]
     out: list[DepthMap | None] = []
     for n in track(range(len(known)), "consistency", len(known)):
         if depths[n] is None:
             out.append(None)
             continue
-        kept, _ = depth_stage.filter_depth(n, known, cameras, sources[n], config)
-        if masks is not None:
-            kept = DepthMap(np.where(masks[n] > 0, kept.depth, 0).astype(np.float32), kept.confidence)
+        kept, _ = depth_stage.filter_depth(n, known, views.cameras, plan.sources[n], config)
+        if views.masks is not None:
+            kept = DepthMap(np.where(views.masks[n] > 0, kept.depth, 0).astype(np.float32), kept.confidence)
         out.append(kept)
     return out
 

@@ -24,7 +24,7 @@ class TexturedSurface:
     """A mesh whose vertices are split where charts meet.
 
     vertices : (V, 3) float64, world. faces : (F, 3) uint32. uv : (V, 2) float32, origin bottom-left. atlas : (h, w, 3) uint8.
-    view : (F,) int32, the photograph of each face, -1 where none sees it.
+    view : (F,) int32, the photograph of each face, -1 where none sees it. gains : (V, 3) float32, each photograph's colour factors.
     """
 
     vertices: Float
@@ -32,6 +32,19 @@ class TexturedSurface:
     uv: NDArray[np.float32]
     atlas: Image
     view: NDArray[np.int32]
+    gains: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Given:
+    """What an earlier instant of a clip settled, so that the texture does not flicker.
+
+    gains : (V, 3) colour factors. centers : (N, 3) float64, middles of the earlier mesh's faces. views : (N,) int32, their photographs.
+    """
+
+    gains: NDArray[np.float32] | None = None
+    centers: Float | None = None
+    views: NDArray[np.int32] | None = None
 
 
 def _detail(image: Image, mask: NDArray[np.uint8] | None, erosion: int) -> NDArray[np.float32]:
@@ -81,6 +94,7 @@ def texture(
     config: TextureConfig | None = None,
     report: Report | None = None,
     track: Track = no_track,
+    given: Given | None = None,
 ) -> TexturedSurface:
     """Texture a mesh from its photographs (after Waechter, Moehrle and Goesele, ECCV 2014).
 
@@ -89,8 +103,9 @@ def texture(
     images : undistorted, (h, w, 3) uint8, one a camera.
     masks : (h, w) uint8, non-zero on the target; nothing outside is copied.
     voxel : scale of the mesh's detail in world units, for visibility; by default its median edge.
+    given : of an earlier instant: its gains are taken, and faces where its surface was keep their photograph if they can.
     """
-    config, report = config or TextureConfig(), report or Report()
+    config, report, given = config or TextureConfig(), report or Report(), given or Given()
     require(len(images) == len(cameras), "images", f"{len(cameras)}, one a camera", len(images))
     vertices = np.ascontiguousarray(surface.vertices, np.float64)
     faces = np.ascontiguousarray(surface.faces, np.uint32)
@@ -108,9 +123,23 @@ def texture(
         quality, colour = _core.rate_faces(vertices, faces, image, detail, depth, p, camera.center.tolist(), tolerance)
         qualities.append(quality)
         colours.append(colour)
+    gains = given.gains if given.gains is not None else colour_gains(qualities, colours)
+    if given.centers is not None and given.views is not None:
+        _prefer(qualities, vertices[faces].mean(1), given.centers, given.views, voxel, config.loyalty)
     labels = _core.select_views(vertices, faces, qualities, colours, config.seam, config.outlier, config.least_patch)
-    gains = colour_gains(qualities, colours)
     return _build(vertices, faces, labels, images, cameras, gains, config, report)
+
+
+def _prefer(
+    qualities: list[NDArray[np.float32]], centers: Float, before: Float, views: NDArray[np.int32], voxel: float, loyalty: float
+) -> None:
+    """Raises the quality of the photograph that the nearest earlier face had, within two voxels."""
+    if not len(centers) or not len(before):
+        return
+    _, number = _core.nearest(np.ascontiguousarray(centers), np.ascontiguousarray(before), 2 * voxel)
+    kept = np.where(number >= 0, views[number], -1)
+    for n, quality in enumerate(qualities):
+        quality[kept == n] *= np.float32(1 + loyalty)
 
 
 def _build(
@@ -149,4 +178,4 @@ def _build(
         "views_used": len(np.unique(labels[labels >= 0])),
         "scale": scale,
     }
-    return TexturedSurface(vertices[origin], new_faces, uv, atlas, labels)
+    return TexturedSurface(vertices[origin], new_faces, uv, atlas, labels, gains)

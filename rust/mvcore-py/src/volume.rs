@@ -186,14 +186,16 @@ pub fn components<'py>(
 }
 
 #[pyfunction]
+#[pyo3(signature = (points, others, reach = f64::INFINITY))]
 pub fn nearest<'py>(
     py: Python<'py>,
     points: PyReadonlyArray2<'py, f64>,
     others: PyReadonlyArray2<'py, f64>,
+    reach: f64,
 ) -> PyResult<(Bound<'py, numpy::PyArray1<f64>>, Bound<'py, numpy::PyArray1<i64>>)> {
     let p = slice(&points, "points")?.as_chunks::<3>().0;
     let q = slice(&others, "others")?.as_chunks::<3>().0;
-    let (distances, numbers) = run(py, || mvcore::nearest::nearest(p, q))?;
+    let (distances, numbers) = run(py, || mvcore::nearest::nearest(p, q, reach))?;
     let n = distances.len();
     Ok((array(py, distances, [n])?, array(py, numbers, [n])?))
 }
