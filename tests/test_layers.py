@@ -29,6 +29,7 @@ ORDER = [
     "nurbs",
     "motion",
     "pipeline",
+    "sequence",
     "schedule",
     "video",
     "viewer",

@@ -120,18 +120,41 @@ def _grown(mask: Mask, camera: Camera, bounds: Bounds, voxel: float) -> Mask:
     return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)))
 
 
-def tight_box(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Bounds:
-    """Box of the hull inside ``bounds``, twice refined; ``bounds`` where the masks have nothing in common."""
+EXPLAINED = 0.97
+"""Share of what the fullest hull shows of the masks that a smaller one must show."""
+
+
+def target_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Occupancy:
+    """The hull in a box of its own, without the phantoms that few views cannot rule out.
+
+    Near few cameras, or outside most pictures, hardly anything speaks against a voxel. So as many cameras must see a voxel as the masks allow:
+    the most for which the hull still covers them.
+    """
+    counts = sorted({max(2, round(share * len(cameras))) for share in (1.0, 0.75, 0.5, 0.25)}, reverse=True)
+    hulls = [_tight_hull(masks, cameras, bounds, config, least) for least in counts]
+    covered = [_covered(h, masks, cameras) for h in hulls]
+    return next(h for h, share in zip(hulls, covered, strict=True) if share >= EXPLAINED * max(covered))
+
+
+def _covered(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camera]) -> float:
+    """Share of the masks that the hull's shadow covers."""
+    total = sum(np.count_nonzero(m) for m in masks)
+    return sum(np.count_nonzero((m > 0) & (shadow(hull, c) > 0)) for m, c in zip(masks, cameras, strict=True)) / max(total, 1)
+
+
+def _tight_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig, least: int) -> Occupancy:
+    """The hull of masks grown by a voxel, its box twice refined; empty where the masks have nothing in common."""
     box = np.asarray(bounds, np.float64)
-    for _ in range(2):
+    hull = Occupancy(box[0], 1.0, np.zeros((1, 1, 1), bool))
+    for _ in range(3):
         voxel = float((box[1] - box[0]).max()) / (config.resolution - 1)
         grown = [_grown(m, c, box, voxel) for m, c in zip(masks, cameras, strict=True)]
-        hull = carve_silhouettes(grown, cameras, box, voxel=voxel, tolerance=config.tolerance)
+        hull = carve_silhouettes(grown, cameras, box, voxel=voxel, tolerance=config.tolerance, least_views=least)
         full = np.argwhere(hull.occupied)
         if not len(full):
-            return box
+            break
         box = hull.origin + hull.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
-    return box
+    return hull
 
 
 def supported(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig, tolerance: float) -> list[Mask]:
@@ -139,7 +162,11 @@ def supported(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, 
 
     All but the share ``tolerance`` of those that see it must. Foreground elsewhere is noise. All pixels where the others have nothing in common.
     """
-    box = tight_box(masks, cameras, bounds, config)
+    hull = target_hull(masks, cameras, bounds, config)
+    box = np.asarray(bounds, np.float64)
+    if hull.occupied.any():
+        full = np.argwhere(hull.occupied)
+        box = hull.origin + hull.voxel * np.stack([full.min(0) - 2.0, full.max(0) + 2.0])
     voxel = float((box[1] - box[0]).max()) / (config.resolution - 1)
     grown = [_grown(m, c, box, voxel) for m, c in zip(masks, cameras, strict=True)]
     found = []

@@ -230,9 +230,7 @@ def finish(
     with clock.stage("surface"):
         surface = extract_surface(volume, config.surface, solid=views.masks is not None)
     with clock.stage("texture"):
-        textured = texture(
-            surface, views.images, views.cameras, views.masks, volume.voxel, config.texture, report, track, given or Given()
-        )
+        textured = texture(surface, views.images, views.cameras, views.masks, volume.voxel, config.texture, report, track, given or Given())
     report.values["mesh"] = {"vertices": len(textured.vertices), "faces": len(textured.faces)}
     report.values["texture"]["gains"] = textured.gains.tolist()
     report.values["bounds"] = plan.box.tolist()
@@ -295,7 +293,9 @@ def _nothing(camera: Camera) -> DepthMap:
     return DepthMap(empty, empty)
 
 
-def filter_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: DepthConfig, track: Track = no_track) -> list[DepthMap | None]:
+def filter_views(
+    views: Views, plan: Plan, depths: list[DepthMap | None], config: DepthConfig, track: Track = no_track
+) -> list[DepthMap | None]:
     """What other views agree with, inside the masks."""
     known = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)]
     out: list[DepthMap | None] = []

@@ -47,7 +47,10 @@ class Pool:
 
 def _lost(error: Exception) -> bool:
     """Whether an error says that the worker is gone, not that the work is wrong."""
-    return isinstance(error, CancelledError | ConnectionError | BrokenExecutor) or type(error).__name__ in ("KilledWorker", "CommClosedError")
+    return isinstance(error, CancelledError | ConnectionError | BrokenExecutor) or type(error).__name__ in (
+        "KilledWorker",
+        "CommClosedError",
+    )
 
 
 @contextmanager
@@ -79,7 +82,9 @@ def _cluster(address: str) -> Iterator[Pool]:
     try:
         from distributed import Client
     except ImportError:
-        raise InvalidInputError("scheduler: expected dask.distributed to be installed (pip install 'mvcore[cluster]'), got no such package") from None
+        raise InvalidInputError(
+            "scheduler: expected dask.distributed to be installed (pip install 'mvcore[cluster]'), got no such package"
+        ) from None
     with Client(address, timeout="30s") as client:
         # The scheduler sends work of a lost worker to another by itself.
         yield Pool(client.get_executor(retries=ATTEMPTS, pure=False))

@@ -85,9 +85,7 @@ def _evidence(image: Image, background: Background, config: TargetConfig) -> _Ev
     relit = lit & np.where(patterned, correlation > config.correlation, plain)
     unchanged = difference < 0.5 * least
     sure = unchanged | (relit & (correlation > 0.75))
-    return _Evidence(
-        ((difference > least) & ~relit | ~background.known) & background.region, sure & background.known | ~background.region
-    )
+    return _Evidence(((difference > least) & ~relit | ~background.known) & background.region, sure & background.known | ~background.region)
 
 
 def _cleaned(mask: Mask, config: TargetConfig) -> Mask:

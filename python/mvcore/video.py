@@ -23,16 +23,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _core, sparse
 from .cameras import Calibration, Camera
-from .carve import Occupancy, carve_silhouettes, shadow, tight_box
+from .carve import Occupancy, shadow, target_hull
 from .config import Config
 from .depth import RoughDepth, seeded_depth
-from .errors import InvalidInputError, ReconstructionError, require
+from .errors import ReconstructionError, require
 from .io.clips import Clips, Source, load_video
 from .io.images import read_image, reduce, undistort
 from .motion import cloud_of, find_poses
 from .pipeline import Plan, Views, check_bounds, filter_views, finish, first_pass, fuse_views, second_pass
 from .result import Reconstruction
 from .schedule import Pool, open_pool
+from .sequence import SequenceWriter
 from .store import Entry, Store, digest, file_digest
 from .surface import marching_cubes
 from .target import Background, foreground, learn_backgrounds
@@ -40,7 +41,7 @@ from .texture import Given
 from .types import Bounds, DepthMap, Image, Report, SparsePoints, Track, no_track
 from .volume import Volume
 
-VERSION = 1
+VERSION = 3
 """Of the entries' content: results of other versions are not taken for one's own."""
 NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 0), bool), np.zeros(0, np.float32))
 
@@ -74,11 +75,13 @@ class VideoReconstruction:
     """The instants of a clip, reconstructed as they are asked for; iterate once over it, or call `save`.
 
     model : after the last instant of a rigid target, one `Reconstruction` of all instants in the first one's frame.
-    trajectory : (T, 4, 4) float64, which bring the model into the world at each instant. times : (T,) seconds.
+    trajectory : (T, 4, 4) float64, which bring the model into the world at each instant, NaN where the target is not seen. times : (T,) seconds;
+    names : of the cameras.
     seconds : wall seconds of each instant; warnings : what the clips, the calibration and the run had to say.
     """
 
     times: NDArray[np.float64]
+    names: list[str]
     warnings: list[str]
     _instants: Iterator[Reconstruction]
     model: Reconstruction | None = None
@@ -90,6 +93,15 @@ class VideoReconstruction:
 
     def __iter__(self) -> Iterator[Reconstruction]:
         return self._instants
+
+    def save(self, folder: str | Path) -> None:
+        """Write what is still to come into a folder: a GLB an instant and target, pictures of depth maps, for a rigid target the model, still
+        and animated, and ``index.json`` at last. Nothing of it stays in memory.
+        """
+        writer = SequenceWriter(folder)
+        for result in self:
+            writer.add(result, split_targets(result), self.names)
+        writer.finish(self.warnings, self.model, self.trajectory)
 
 
 def reconstruct_video(
@@ -157,7 +169,7 @@ def reconstruct_video(
     )
     if target == "rigid":
         require(not job.whole, "background", "a target for target='rigid'", "False: the whole scene")
-    run = VideoReconstruction(clips.times, list(clips.warnings), iter(()))
+    run = VideoReconstruction(clips.times, names, list(clips.warnings), iter(()))
     run._instants = _Run(job, run, target == "rigid", executor, scheduler, track or no_track, temporary).instants()
     return run
 
@@ -220,7 +232,9 @@ def _plate_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         raise FileNotFoundError(f"{folder}: no such folder of clean plates")
     found = {}
     for name in names:
-        files = sorted([*folder.glob(f"{name}.*"), *folder.glob(f"{name}/background.*"), *folder.glob(f"{name}/*.png"), *folder.glob(f"{name}/*.jpg")])
+        files = sorted(
+            [*folder.glob(f"{name}.*"), *folder.glob(f"{name}/background.*"), *folder.glob(f"{name}/*.png"), *folder.glob(f"{name}/*.jpg")]
+        )
         require(files, "background", f"a clean plate of every camera in {folder}", f"none of {name}")
         found[name] = files[0]
     return found
@@ -304,7 +318,9 @@ def _learn(job: Job) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         missing = [n for n, p in enumerate(job.plates) if p is None]
         learnt: dict[int, Background] = {}
         if missing:
-            require(len(job.clips) >= 3, "background", "a clean plate of every camera, or at least 3 instants to learn it from", len(job.clips))
+            require(
+                len(job.clips) >= 3, "background", "a clean plate of every camera, or at least 3 instants to learn it from", len(job.clips)
+            )
             chosen = _samples(job)
             frames = [[job.clips.undistorted(n, t) for t in chosen] for n in missing]
             learnt = dict(zip(missing, learn_backgrounds(frames, [cameras[n] for n in missing], job.config.target), strict=True))
@@ -339,20 +355,29 @@ def _prepare(job: Job, learn_key: str, instant: int) -> tuple[dict[str, NDArray[
     masks = None
     if job.masks is not None:
         pictures = [job.masks.frame(n, instant).max(2) for n in range(len(cameras))]
-        masks = [undistort(np.where(p > 127, 255, 0).astype(np.uint8), c, nearest=True) for p, c in zip(pictures, job.clips.calib, strict=True)]
+        masks = [
+            undistort(np.where(p > 127, 255, 0).astype(np.uint8), c, nearest=True) for p, c in zip(pictures, job.clips.calib, strict=True)
+        ]
     elif not job.whole:
         arrays = learnt.arrays
         backgrounds = [
-            Background(arrays[f"plate{n}"], arrays[f"known{n}"], arrays[f"region{n}"], learnt.meta["learnt"][n]) for n in range(len(cameras))
+            Background(arrays[f"plate{n}"], arrays[f"known{n}"], arrays[f"region{n}"], learnt.meta["learnt"][n])
+            for n in range(len(cameras))
         ]
         masks = foreground(images, cameras, backgrounds, around, config.target, config.carve)
     targets: list[dict[str, Any]] = []
     box = around
     if masks is not None:
-        hull = _coarse_hull(masks, cameras, around, config)
+        hull = target_hull(masks, cameras, around, config.carve)
         targets = _targets(hull, config.video.least_target)
         if not targets:
-            return {"box": box}, {"empty": True, "targets": [], "sources": [], "report": {}, "warnings": ["no target is seen at this instant"]}
+            return {"box": box}, {
+                "empty": True,
+                "targets": [],
+                "sources": [],
+                "report": {},
+                "warnings": ["no target is seen at this instant"],
+            }
         box = np.stack([np.min([t["box"][0] for t in targets], 0), np.max([t["box"][1] for t in targets], 0)])
         if job.bounds is not None:
             box = np.stack([np.maximum(box[0], job.bounds[0]), np.minimum(box[1], job.bounds[1])])
@@ -365,17 +390,17 @@ def _prepare(job: Job, learn_key: str, instant: int) -> tuple[dict[str, NDArray[
     if masks is None and job.bounds is None:
         box = sparse.target_box(views.cameras, points)
     plan = _plan(views, points, box, bounded, config, report)
-    return _view_arrays(views, plan), {"empty": False, "targets": targets, "sources": plan.sources, "report": report.values, "warnings": report.warnings}
+    return _view_arrays(views, plan), {
+        "empty": False,
+        "targets": targets,
+        "sources": plan.sources,
+        "report": report.values,
+        "warnings": report.warnings,
+    }
 
 
 def _no_points(count: int) -> SparsePoints:
     return replace(NO_POINTS, visible=np.zeros((count, 0), bool))
-
-
-def _coarse_hull(masks: Sequence[NDArray[np.uint8]], cameras: Sequence[Camera], around: Bounds, config: Config) -> Occupancy:
-    box = tight_box(masks, cameras, around, config.carve)
-    tolerance = config.volume.hull_tolerance if len(cameras) < 5 else config.carve.tolerance
-    return carve_silhouettes(masks, cameras, box, resolution=config.carve.resolution, tolerance=tolerance)
 
 
 def _targets(hull: Occupancy, least: float) -> list[dict[str, Any]]:
@@ -398,7 +423,9 @@ def _targets(hull: Occupancy, least: float) -> list[dict[str, Any]]:
     return found
 
 
-def _cropped(images: Sequence[Image], masks: Sequence[NDArray[np.uint8]], cameras: Sequence[Camera], hull: Occupancy, config: Config) -> Views:
+def _cropped(
+    images: Sequence[Image], masks: Sequence[NDArray[np.uint8]], cameras: Sequence[Camera], hull: Occupancy, config: Config
+) -> Views:
     """Each view cut to its mask and the hull's shadow in it, with a margin."""
     pictures, cuts, kept = [], [], []
     for image, mask, camera in zip(images, masks, cameras, strict=True):
@@ -617,7 +644,11 @@ class _Run:
         views, plan, prepared = _prepared(job, done.prepare)
         mesh, fused = _get(job, done.mesh), _get(job, done.fuse)
         a = mesh.arrays
-        report = mesh.meta["report"] | {"instant": done.instant, "time": float(job.clips.times[done.instant]), "targets": prepared.meta["targets"]}
+        report = mesh.meta["report"] | {
+            "instant": done.instant,
+            "time": float(job.clips.times[done.instant]),
+            "targets": prepared.meta["targets"],
+        }
         return Reconstruction(
             vertices=a["vertices"],
             faces=a["faces"],
@@ -817,4 +848,4 @@ def _subset(result: Reconstruction, faces: NDArray[np.bool_], number: int) -> Re
     )
 
 
-__all__ = ["InvalidInputError", "VideoReconstruction", "reconstruct_video", "split_targets"]
+__all__ = ["VideoReconstruction", "reconstruct_video", "split_targets"]
