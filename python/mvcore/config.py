@@ -204,6 +204,8 @@ class VideoConfig:
     """1 - ZNCC above which a pixel started from the surface before it is in doubt."""
     least_target: float = 0.1
     """Parts of the hull with a smaller share of the largest part's volume are no targets."""
+    model_instants: int = 16
+    """Most instants, spread over the clip, whose views make a rigid target's model."""
     registration_points: int = 30_000
     """Points an instant for the poses of a rigid target."""
     registration_rounds: int = 40

@@ -43,6 +43,16 @@ def cloud_of(depths: Sequence[DepthMap | None], cameras: Sequence[Camera], count
     return Cloud(every[chosen], directions[chosen])
 
 
+def cloud_of_mesh(vertices: Float, faces: NDArray[np.uint32], count: int, seed: int = 0) -> Cloud:
+    """About ``count`` of a mesh's faces as points."""
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(faces))[:count])
+    a, b, c = (vertices[faces[chosen, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    good = length > 0
+    return Cloud(((a + b + c) / 3)[good], normal[good] / length[good, None])
+
+
 def _surface(depth: NDArray[np.float32], camera: Camera) -> tuple[Float, Float]:
     """Points and normals of the pixels whose 5 x 5 surroundings are known and smooth."""
     known = cv2.erode((depth > 0).astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0

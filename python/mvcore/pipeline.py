@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from . import depth as depth_stage
 from . import sparse as sparse_stage
 from .cameras import Calibration, Camera
-from .carve import photo_hull, visual_hull
-from .config import Config, DepthConfig
+from .carve import photo_hull, target_hull, visual_hull
+from .config import CarveConfig, Config, DepthConfig
 from .depth import View
 from .errors import ReconstructionError, require
 from .io import load
@@ -174,7 +174,7 @@ def make_plan(views: Views, given: Bounds | None, config: Config, report: Report
     """
     cameras, masks = views.cameras, views.masks
     points = sparse_stage.find_points(views.images, cameras, masks, config.sparse, report, track)
-    box = given if given is not None else _target(cameras, points, masks)
+    box = given if given is not None else _target(cameras, points, masks, config.carve)
     # Masks show the target alone: its box bounds the search as given bounds do.
     bounded = given is not None or masks is not None
     ranges = sparse_stage.depth_ranges(cameras, points, box, config.sparse.range_stretch, bounded)
@@ -248,10 +248,14 @@ def finish(
     )
 
 
-def _target(cameras: Sequence[Camera], points: SparsePoints, masks: Masks | None) -> Bounds:
+def _target(cameras: Sequence[Camera], points: SparsePoints, masks: Masks | None, config: CarveConfig) -> Bounds:
     """The target's box; with masks that of the visual hull."""
     box = sparse_stage.target_box(cameras, points)
-    return box if masks is None else sparse_stage.hull_box(cameras, masks, box)
+    if masks is None:
+        return box
+    hull = target_hull(masks, cameras, box, config)
+    full = np.argwhere(hull.occupied)
+    return box if not len(full) else hull.origin + hull.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
 
 
 def _say_left_out(sources: list[list[int]], cameras: Sequence[Camera], report: Report) -> None:

@@ -384,31 +384,3 @@ def view_scores(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, co
 def choose_sources(scores: Float, count: int) -> list[list[int]]:
     """The best sources of each view, best first; views that share nothing have none."""
     return [[int(j) for j in np.argsort(-row, kind="stable")[:count] if row[j] > 0] for row in scores]
-
-
-def hull_box(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]], around: Bounds, samples: int = 72) -> Bounds:
-    """Box of the visual hull: places inside the masks of nearly all the cameras that see them, twice refined.
-
-    Falls back to ``around`` where the masks have nothing in common.
-    """
-    box = around
-    for _ in range(2):
-        axes = [np.linspace(box[0, k], box[1, k], samples) for k in range(3)]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        seen, inside = np.zeros(len(grid), np.int32), np.zeros(len(grid), np.int32)
-        cell = np.array([a[1] - a[0] for a in axes])
-        for camera, mask in zip(cameras, masks, strict=True):
-            visible = np.flatnonzero(in_view(camera, grid))
-            x = np.rint(camera.project(grid[visible])).astype(int)
-            # A sample stands for its cell: masks grow by the cell's radius in the image.
-            depth = np.median((grid[visible] - camera.center) @ camera.axis) if len(visible) else 1.0
-            reach = int(np.ceil(0.9 * np.linalg.norm(cell) * camera.K[0, 0] / max(depth, 1e-9)))
-            grown = cv2.dilate(mask, np.ones((2 * min(reach, 50) + 1,) * 2, np.uint8))
-            x = np.clip(x, 0, [camera.width - 1, camera.height - 1])
-            seen[visible] += 1
-            inside[visible] += grown[x[:, 1], x[:, 0]] > 0
-        hull = grid[(seen >= max(2, 0.5 * len(cameras))) & (inside >= 0.95 * seen)]
-        if not len(hull):
-            return box
-        box = np.stack([hull.min(0) - cell, hull.max(0) + cell])
-    return box

@@ -1,6 +1,6 @@
 """Multi-view video: a textured mesh an instant, or one model of a rigid target from all of them.
 
-The work is cut into pure functions of stored inputs (`_learn`, `_prepare`, `_first`, `_second`, `_fuse`, `_mesh`, `_model`). Each
+The work is cut into pure functions of stored inputs (`_learn`, `_prepare`, `_first`, `_second`, `_fuse`, `_mesh`, and for a rigid target `_poses` and `_model...`). Each
 writes one entry of the `Store` under a key made of its inputs and settings, so that any executor may run it, twice if need be,
 and a run that was killed finds what it had finished.
 """
@@ -29,7 +29,7 @@ from .depth import RoughDepth, seeded_depth
 from .errors import ReconstructionError, require
 from .io.clips import Clips, Source, load_video
 from .io.images import read_image, reduce, undistort
-from .motion import cloud_of, find_poses
+from .motion import cloud_of, cloud_of_mesh, find_poses
 from .pipeline import Plan, Views, check_bounds, filter_views, finish, first_pass, fuse_views, second_pass
 from .result import Reconstruction
 from .schedule import Pool, open_pool
@@ -41,7 +41,7 @@ from .texture import Given
 from .types import Bounds, DepthMap, Image, Report, SparsePoints, Track, no_track
 from .volume import Volume
 
-VERSION = 3
+VERSION = 4
 """Of the entries' content: results of other versions are not taken for one's own."""
 NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 0), bool), np.zeros(0, np.float32))
 
@@ -663,18 +663,39 @@ class _Run:
         )
 
     def _fuse_all(self, pool: Pool, results: Sequence[_Done]) -> None:
-        job = self.job
-        seen = [d for d in results if d.mesh is not None]
+        job, seen = self.job, [d for d in results if d.mesh is not None]
         if len(seen) < 2:
             raise ReconstructionError(f"a rigid model needs the target at two instants at least, it is seen at {len(seen)}")
-        keys = [(d.prepare, d.fuse, d.depths) for d in seen]
-        key = digest("model", [[p, f, {str(k): v for k, v in m.items()}] for p, f, m in keys])
-        pool.start(_model, job, key, keys)()
-        entry = _get(job, key)
+        named = [(d.prepare, d.fuse, d.mesh or "") for d in seen]
+        poses_key = digest("poses", named)
+        pool.start(_poses, job, poses_key, named)()
+        poses = _get(job, poses_key)
+        self.out.trajectory = np.full((len(results), 4, 4), np.nan)
+        self.out.trajectory[[d.instant for d in seen]] = poses.arrays["poses"]
+        # Spread over the clip: more instants add little, and all are kept in memory.
+        chosen = sorted({int(n) for n in np.linspace(0, len(seen) - 1, min(len(seen), job.config.video.model_instants)).round()})
+        prepares = tuple(seen[n].prepare for n in chosen)
+        used = digest("chosen", poses_key, chosen)
+        if used not in job.store:
+            job.store.save(used, poses.arrays | {"poses": poses.arrays["poses"][chosen]}, poses.meta)
+        plan_key = digest("model plan", used, prepares)
+        pool.start(_model_plan, job, plan_key, prepares, used)()
+        views = [n for n, s in enumerate(_get(job, plan_key).meta["sources"]) if s]
+        seconds = {n: digest("model second", plan_key, n) for n in views}
+        model_key = digest("model", plan_key)
+        if model_key not in job.store:
+            missing = [n for n in views if seconds[n] not in job.store]
+            firsts = {n: digest("model first", plan_key, n) for n in views}
+            if missing:
+                for wait in [pool.start(_model_first, job, firsts[n], prepares, used, n) for n in views]:
+                    wait()
+                for wait in [pool.start(_model_second, job, seconds[n], prepares, used, n, firsts) for n in missing]:
+                    wait()
+                for key in firsts.values():
+                    job.store.path(key).unlink(missing_ok=True)
+            pool.start(_model, job, model_key, prepares, used, seconds)()
+        entry = _get(job, model_key)
         a = entry.arrays
-        poses = np.full((len(results), 4, 4), np.nan)
-        poses[[d.instant for d in seen]] = a["poses"]
-        self.out.trajectory = poses
         self.out.model = Reconstruction(
             vertices=a["vertices"],
             faces=a["faces"],
@@ -785,39 +806,104 @@ class _Chain:
 
 
 @_once
-def _model(job: Job, keys: Sequence[tuple[str, str, dict[int, str]]]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Poses of a rigid target, and one mesh of all instants in the first one's frame."""
-    config, report = job.config, Report()
-    clouds, parts, boxes = [], [], []
-    for number, (prepare, fuse, depths) in enumerate(keys):
+def _poses(job: Job, keys: Sequence[tuple[str, str, str]]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Where a rigid target is at each instant; ``keys`` name each one's preparation, field and mesh."""
+    config, report, clouds = job.config.video, Report(), []
+    box: Bounds | None = None
+    for number, (prepare, fuse, mesh) in enumerate(keys):
         views, plan, _ = _prepared(job, prepare)
         filtered = _filtered_of(_get(job, fuse).arrays, len(views.images))
-        require(any(d is not None for d in filtered), "target", "depth maps for a rigid target", "a visual hull alone")
-        clouds.append(cloud_of(filtered, views.cameras, config.video.registration_points, number))
-        parts.append((views, _depth_maps(job, depths, len(views.images))))
-        boxes.append(plan.box)
-    size = float(np.linalg.norm(boxes[0][1] - boxes[0][0]))
-    poses, shares = find_poses(clouds, size, config.video.registration_rounds)
-    report.values["rigid"] = {"instants": len(keys), "overlap": shares.round(3).tolist()}
+        box = plan.box if box is None else box
+        if any(d is not None for d in filtered):
+            clouds.append(cloud_of(filtered, views.cameras, config.registration_points, number))
+        else:
+            a = _get(job, mesh).arrays
+            clouds.append(cloud_of_mesh(a["vertices"], a["faces"], config.registration_points, number))
+    assert box is not None
+    poses, shares = find_poses(clouds, float(np.linalg.norm(box[1] - box[0])), config.registration_rounds)
     for n, share in enumerate(shares):
         if share < 0.3:
-            report.warn(f"only {share:.0%} of instant {n}'s surface lies on the one before: its pose is doubtful")
+            report.warn(f"only {share:.0%} of the target's surface at its instant {n} lies on the one before: its pose is doubtful")
+    meta = {"report": {"instants": len(keys), "overlap": shares.round(3).tolist()}, "warnings": report.warnings}
+    return {"poses": poses, "box": box}, meta
+
+
+@lru_cache(maxsize=1)
+def _gathered(job_folder: Path, prepare_keys: tuple[str, ...], poses_key: str, job: _Same) -> tuple[Views, Plan]:
+    """All instants' views in the target's frame, as if it had stood still and the cameras had moved."""
+    entry = _get(job.job, poses_key)
+    box = entry.arrays["box"]
     images: list[Image] = []
     masks: list[NDArray[np.uint8]] = []
     cameras: list[Camera] = []
-    maps: list[DepthMap | None] = []
-    for (views, found), pose in zip(parts, poses, strict=True):
+    for key, pose in zip(prepare_keys, entry.arrays["poses"], strict=True):
+        views, _, _ = _prepared(job.job, key)
         images += views.images
         masks += views.masks or []
         cameras += [c.moved(pose) for c in views.cameras]
-        maps += found
-    every = Views(images, masks, cameras)
-    box = boxes[0]
-    sources = sparse.choose_sources(sparse.view_scores(cameras, _no_points(len(cameras)), box, config.depth), MODEL_SOURCES)
-    plan = Plan(_no_points(len(cameras)), box, [(0.0, 0.0)] * len(cameras), sources)
-    arrays = _fused(every, plan, maps, config, report)
-    result = finish(every, plan, [], _volume_of(arrays), config, report)
-    return _result_arrays(result) | {"poses": poses, "box": box}, {"report": result.report}
+    plan = _plan(Views(images, masks, cameras), _no_points(len(cameras)), box, True, job.job.config, Report())
+    return Views(images, masks, cameras), plan
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """A job as an argument of a cached function: the other arguments tell its results apart."""
+
+    job: Job
+
+    def __hash__(self) -> int:
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same)
+
+
+def _all_views(job: Job, prepare_keys: Sequence[str], poses_key: str) -> tuple[Views, Plan]:
+    return _gathered(job.folder, tuple(prepare_keys), poses_key, _Same(job))
+
+
+@_once
+def _model_plan(job: Job, prepare_keys: Sequence[str], poses_key: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Which views of which instants show the same surface."""
+    _, plan = _all_views(job, prepare_keys, poses_key)
+    return {}, {"sources": plan.sources}
+
+
+@_once
+def _model_first(job: Job, prepare_keys: Sequence[str], poses_key: str, n: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """View ``n``'s first pass against views of all instants."""
+    views, plan = _all_views(job, prepare_keys, poses_key)
+    return first_pass(views, plan, n, job.config).arrays(), {}  # type: ignore[return-value]
+
+
+@_once
+def _model_second(
+    job: Job, prepare_keys: Sequence[str], poses_key: str, n: int, first_keys: dict[int, str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """View ``n``'s depth map among those of all instants."""
+    views, plan = _all_views(job, prepare_keys, poses_key)
+    wanted = {n, *plan.sources[n]}
+    rough = {k: RoughDepth.from_arrays(_get(job, key).arrays) for k, key in first_keys.items() if k in wanted}
+    found = second_pass(views, plan, n, rough, job.config)
+    return {"depth": found.depth, "confidence": found.confidence}, {}
+
+
+@_once
+def _model(
+    job: Job, prepare_keys: Sequence[str], poses_key: str, depth_keys: dict[int, str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """One mesh of all instants in the first one's frame."""
+    views, plan = _all_views(job, prepare_keys, poses_key)
+    poses = _get(job, poses_key)
+    report = Report({"rigid": poses.meta["report"]}, list(poses.meta["warnings"]))
+    # With so many views less noise is left to be smoothed away than at one instant.
+    config = replace(job.config, volume=replace(job.config.volume, solid_smoothing=job.config.volume.smoothing))
+    near = sparse.choose_sources(sparse.view_scores(views.cameras, plan.points, plan.box, config.depth), MODEL_SOURCES)
+    if any(plan.sources):
+        plan = replace(plan, sources=near)
+    arrays = _fused(views, plan, _depth_maps(job, depth_keys, len(views.images)), config, report)
+    result = finish(views, plan, [], _volume_of(arrays), config, report)
+    return _result_arrays(result) | {"box": plan.box}, {"report": result.report}
 
 
 MODEL_SOURCES = 12

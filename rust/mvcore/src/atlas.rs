@@ -2,13 +2,13 @@
 //!
 //! ```text
 //!   faces of one view that hang together ──► chart = the photograph's rectangle around them ──► skyline packing
-//!   colour jumps along seams ──► smooth corrections inside the charts (least squares, conjugate gradients) ──► paint
+//!   colour jumps along seams ──► smooth corrections inside the charts (level) ──► paint
 //! ```
 //!
-//! A chart keeps the photograph's own pixels, so painting copies without resampling. Seam levelling after Lempitsky and Ivanov,
-//! CVPR 2007; faces that no view sees take the colours of their neighbours from a palette, a few cells that many of them share.
+//! A chart keeps the photograph's own pixels, so painting copies without resampling. Faces that no view sees take the colours of their neighbours from a palette, a few cells that many of them share.
 
 use crate::error::{Result, require};
+use crate::level::level;
 use crate::mesh::{Mesh, NOTHING, components, neighbours, project};
 use crate::pack::pack;
 use crate::raster::Raster;
@@ -20,11 +20,6 @@ const PADDING: i64 = 3;
 const CELL: usize = 4;
 /// Grey levels from one colour of the palette to the next.
 const SHADE: f32 = 8.0;
-/// Pull of neighbouring corrections towards each other, relative to a seam's pull.
-const SMOOTHNESS: f64 = 0.1;
-/// Pull of corrections towards zero: fixes the overall brightness.
-const ANCHOR: f64 = 1e-3;
-const MOST_ITERATIONS: usize = 300;
 
 /// The rectangle that a chart copies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,7 +69,7 @@ pub fn build_atlas(mesh: Mesh, labels: &[i32], sources: &[Source], max_size: usi
     let split = Split::new(mesh, labels, &part, count, sources);
     let mut charts = split.charts(count);
     let colours = split.colours(sources);
-    let corrections = split.level(labels, &colours);
+    let corrections = level(&split.part, &split.pixel, &split.seams(&colours));
     let palette = Palette::new(mesh, labels, &split, &colours, &corrections);
     let sizes: Vec<(usize, usize)> = charts.iter().map(|c| c.map_or((0, 0), |c| c.size)).collect();
     let (places, width, used) = pack(&sizes, palette.colours.len() * CELL * CELL, CELL);
@@ -196,100 +191,21 @@ impl Split {
             .collect()
     }
 
-    /// Corrections that make the charts meet: minimises jumps across seams and slopes within charts.
-    fn level(&self, labels: &[i32], colours: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let n = self.origin.len();
-        let mut links: Vec<(u32, u32, f64)> = Vec::new();
-        for (face, _) in self.faces.iter().zip(labels).filter(|(_, label)| **label != NOTHING) {
-            for e in 0..3 {
-                links.push((face[e], face[(e + 1) % 3], SMOOTHNESS / 2.0)); // an inner edge comes twice
-            }
-        }
-        let mut copies: Vec<(u32, u32)> =
-            (0..n as u32).filter(|&v| self.view[v as usize] != NOTHING).map(|v| (self.origin[v as usize], v)).collect();
+    /// Colour jumps between the copies of split vertices.
+    fn seams(&self, colours: &[[f64; 3]]) -> Vec<(u32, u32, [f64; 3])> {
+        let mut copies: Vec<(u32, u32)> = self.origin.iter().zip(0..).map(|(&o, v)| (o, v)).collect();
         copies.sort_unstable();
-        let mut target = vec![[0.0; 3]; n];
+        let mut seams = Vec::new();
         for group in copies.chunk_by(|a, b| a.0 == b.0) {
-            for i in 0..group.len() {
-                for j in i + 1..group.len() {
-                    let (a, b) = (group[i].1 as usize, group[j].1 as usize);
-                    links.push((a as u32, b as u32, 1.0));
-                    for k in 0..3 {
-                        let jump = colours[b][k] - colours[a][k];
-                        target[a][k] += jump;
-                        target[b][k] -= jump;
-                    }
+            for (i, &(_, a)) in group.iter().enumerate() {
+                for &(_, b) in &group[i + 1..] {
+                    let (from, to) = (colours[a as usize], colours[b as usize]);
+                    seams.push((a, b, std::array::from_fn(|c| to[c] - from[c])));
                 }
             }
         }
-        solve(n, &links, &target)
+        seams
     }
-}
-
-/// Conjugate gradients with a diagonal preconditioner on the graph of `links`, three channels at once.
-fn solve(n: usize, links: &[(u32, u32, f64)], target: &[[f64; 3]]) -> Vec<[f64; 3]> {
-    let mut start = vec![0u32; n + 1];
-    for &(a, b, _) in links {
-        start[a as usize + 1] += 1;
-        start[b as usize + 1] += 1;
-    }
-    for i in 0..n {
-        start[i + 1] += start[i];
-    }
-    let mut fill = start.clone();
-    let mut to = vec![(0u32, 0.0f64); links.len() * 2];
-    for &(a, b, w) in links {
-        for (p, q) in [(a, b), (b, a)] {
-            to[fill[p as usize] as usize] = (q, w);
-            fill[p as usize] += 1;
-        }
-    }
-    let row = |i: usize| &to[start[i] as usize..start[i + 1] as usize];
-    let diagonal: Vec<f64> = (0..n).map(|i| ANCHOR + row(i).iter().map(|l| l.1).sum::<f64>()).collect();
-    let apply = |x: &[[f64; 3]], y: &mut [[f64; 3]]| {
-        y.par_iter_mut().enumerate().for_each(|(i, y)| {
-            let mut s = x[i].map(|v| v * diagonal[i]);
-            for &(j, w) in row(i) {
-                (0..3).for_each(|k| s[k] -= w * x[j as usize][k]);
-            }
-            *y = s;
-        });
-    };
-    // Sequential sums: the same bytes for any thread count.
-    let dot = |a: &[[f64; 3]], b: &[[f64; 3]]| {
-        let mut s = [0.0; 3];
-        a.iter().zip(b).for_each(|(p, q)| (0..3).for_each(|k| s[k] += p[k] * q[k]));
-        s
-    };
-    let precondition =
-        |r: &[[f64; 3]]| -> Vec<[f64; 3]> { r.iter().zip(&diagonal).map(|(r, d)| r.map(|v| v / d)).collect() };
-    let mut x = vec![[0.0; 3]; n];
-    let mut r = target.to_vec();
-    let mut z = precondition(&r);
-    let mut p = z.clone();
-    let mut q = vec![[0.0; 3]; n];
-    let mut rz = dot(&r, &z);
-    let goal = rz.map(|v| v * 1e-6 + 1e-30);
-    for _ in 0..MOST_ITERATIONS {
-        if (0..3).all(|k| rz[k] <= goal[k]) {
-            break;
-        }
-        apply(&p, &mut q);
-        let pq = dot(&p, &q);
-        let alpha: [f64; 3] = std::array::from_fn(|k| if pq[k] > 0.0 { rz[k] / pq[k] } else { 0.0 });
-        for i in 0..n {
-            for k in 0..3 {
-                x[i][k] += alpha[k] * p[i][k];
-                r[i][k] -= alpha[k] * q[i][k];
-            }
-        }
-        z = precondition(&r);
-        let next = dot(&r, &z);
-        let beta: [f64; 3] = std::array::from_fn(|k| if rz[k] > 0.0 { next[k] / rz[k] } else { 0.0 });
-        p.iter_mut().zip(&z).for_each(|(p, z)| (0..3).for_each(|k| p[k] = z[k] + beta[k] * p[k]));
-        rz = next;
-    }
-    x
 }
 
 fn bilinear(rgb: &Raster<u8>, x: f64, y: f64) -> [f64; 3] {

@@ -2,7 +2,7 @@
 //!
 //! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`]) ← one file a kernel. Five kernels stand on a part
 //! of their own: [`slanted`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`], [`atlas`] on
-//! [`pack`]; no other calls another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's
+//! [`pack`] and [`level`]; no other calls another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's
 //! global pool; every kernel gives the same bytes for any number of them.
 
 pub mod aggregate;
@@ -16,6 +16,7 @@ pub mod files;
 pub mod fuse;
 pub mod grid;
 pub mod isosurface;
+pub mod level;
 pub mod match_epipolar;
 pub mod memory;
 pub mod mesh;
