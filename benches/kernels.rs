@@ -7,6 +7,7 @@
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use mvcore::aggregate::{Penalties, aggregate};
 use mvcore::atlas::{Source, build_atlas};
+use mvcore::carve::{CarveParams, Silhouette, carve};
 use mvcore::consistency::{ConsistencyParams, OtherView, consistency};
 use mvcore::fuse::{FusionParams, FusionView, fuse};
 use mvcore::grid::Grid;
@@ -137,6 +138,7 @@ fn volumes(c: &mut Criterion) {
         depth: raster(&depth),
         weight: raster(&weight),
         silhouette: None,
+        window: [0.0, 0.0, (w - 1) as f64, (h - 1) as f64],
         projection: ring(24, k, w, h, focal).0,
         focal,
     };
@@ -145,6 +147,14 @@ fn volumes(c: &mut Criterion) {
     let mut group = c.benchmark_group("volume");
     group.sample_size(10);
     group.throughput(Throughput::Elements((24 * w * h) as u64));
+    let mask: Vec<u8> = depth.iter().map(|&d| u8::from(d > 0.0)).collect();
+    let silhouette =
+        |k| Silhouette { mask: Raster::new(&mask, w, h, "mask").unwrap(), projection: ring(24, k, w, h, focal).0 };
+    let silhouettes: Vec<_> = (0..24).map(silhouette).collect();
+    let vote = CarveParams { tolerance: 0.05, least_views: 2 };
+    group.bench_function("carve 24 silhouettes 640x480 into 256^3", |b| {
+        b.iter(|| carve(grid, &silhouettes, &vote).unwrap())
+    });
     group.bench_function("fuse 24 maps 640x480 into 256^3", |b| b.iter(|| fuse(grid, &views, &FUSION).unwrap()));
     let smooth = FusionParams { smoothing: 0.7, ..FUSION };
     group.bench_function("the same, smoothed", |b| b.iter(|| fuse(grid, &views, &smooth).unwrap()));

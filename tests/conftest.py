@@ -60,6 +60,60 @@ def render_sphere(camera: mvcore.Camera, radius=0.5):
     return image.reshape(*shape, 3), np.where(hit, s, 0).reshape(shape), hit.reshape(shape)
 
 
+BALLS = [((0.0, 0.0, 0.0), 0.4), ((0.35, 0.1, 0.15), 0.25), ((-0.1, 0.35, -0.2), 0.22)]
+
+
+def render_target(camera: mvcore.Camera, pose=None):
+    """Three textured balls grown together, moved by ``pose`` (4, 4), before the same wall; without a pose the wall alone."""
+    grid = camera.pixel_grid().reshape(-1, 2)
+    rays = np.column_stack([grid, np.ones(len(grid))]) @ np.linalg.inv(camera.K).T @ camera.R
+    o, s = camera.center, np.full(len(grid), 6.0)
+    back = np.eye(4) if pose is None else np.linalg.inv(pose)
+    hit = np.zeros(len(grid), bool)
+    for center, radius in BALLS if pose is not None else ():
+        to = o - (pose[:3, :3] @ center + pose[:3, 3])
+        a, b, c = (rays**2).sum(1), rays @ to, to @ to - radius**2
+        root = b * b - a * c
+        near = (-b - np.sqrt(root.clip(0))) / a
+        closer = (root > 0) & (near < s)
+        s[closer] = near[closer]
+        hit |= closer
+    points = o + rays * s[:, None]
+    own = points @ back[:3, :3].T + back[:3, 3]
+    image = np.where(hit[:, None], texture_of(own), texture_of(points * 0.7 + 3))
+    shape = (camera.height, camera.width)
+    return image.reshape(*shape, 3), hit.reshape(shape)
+
+
+def turned(angle: float, shift) -> np.ndarray:
+    """A pose: a turn about z in degrees, then a shift."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return np.array([[c, -s, 0, shift[0]], [s, c, 0, shift[1]], [0, 0, 1, shift[2]], [0, 0, 0, 1]])
+
+
+def write_clips(folder: Path, cameras, poses, plates=True) -> Path:
+    """A folder of image clips of `render_target` with its calibration."""
+    views = []
+    for n, c in enumerate(cameras):
+        own = folder / "images" / f"cam{n:02d}"
+        own.mkdir(parents=True)
+        for t, pose in enumerate(poses):
+            cv2.imwrite(str(own / f"frame{t:04d}.png"), render_target(c, pose)[0][..., ::-1])
+        if plates:
+            cv2.imwrite(str(own / "background.png"), render_target(c)[0][..., ::-1])
+        view = {"name": f"cam{n:02d}", "width": c.width, "height": c.height}
+        views.append(view | {"K": c.K.tolist(), "R": c.R.tolist(), "t": c.t.tolist()})
+    (folder / "cameras.json").write_text(json.dumps({"views": views}))
+    return folder
+
+
+def rig(count=12, size=(160, 120)):
+    """Cameras around the origin, all of which see a target of some size there."""
+    angles = 2 * np.pi * np.arange(count) / count
+    focal = 0.94 * size[0]
+    return [look_at((2.6 * np.cos(a), 2.6 * np.sin(a), 0.9 * (i % 2)), (0, 0, 0), size, focal) for i, a in enumerate(angles)]
+
+
 @pytest.fixture(scope="session")
 def ring():
     """Twelve views around a textured sphere: cameras, images, depths, masks."""

@@ -49,3 +49,17 @@ def consistency(depth, others, cameras, pixel_unit, depth_unit, min_views):
         if rule or (agreeing >= min_views and 2 * agreeing >= len(votes)):
             kept[y, x] = z
     return kept
+
+
+def carve(origin, voxel, shape, masks, projections, tolerance, least_views):
+    """Votes of every view on every voxel, nearest pixel."""
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 3)
+    points = np.asarray(origin) + voxel * index
+    seen, against = np.zeros(len(points), int), np.zeros(len(points), int)
+    for mask, p in zip(masks, projections):
+        q = points @ p[:, :3].T + p[:, 3]
+        x = np.rint(q[:, :2] / q[:, 2:]).astype(int)
+        inside = (q[:, 2] > 0) & (x >= 0).all(1) & (x < mask.shape[::-1]).all(1)
+        seen += inside
+        against[inside] += mask[x[inside, 1], x[inside, 0]] == 0
+    return ((seen >= least_views) & (against <= tolerance * seen)).reshape(shape)

@@ -22,7 +22,6 @@ from mvcore.sparse import (
     detect,
     find_points,
     fundamental,
-    hull_box,
     surrounds,
     target_box,
     view_scores,
@@ -95,14 +94,6 @@ def test_textureless_scenes_fall_back_to_the_common_volume(ring):
     box = target_box(cameras, points)
     assert np.allclose(box, common_volume(cameras))
     assert "too few sure matches" in report.warnings[0]
-
-
-def test_the_box_of_the_hull_is_tight(ring):
-    cameras, _, _, masks = ring
-    grown = [(m * 255).astype(np.uint8) for m in masks]
-    box = hull_box(cameras, grown, np.array([[-2.0, -2, -2], [2, 2, 2]]))
-    assert (np.abs(box) >= 0.5).all()
-    assert (np.abs(box) < 0.75).all()
 
 
 def test_depth_of_a_sphere_and_its_filter(ring):

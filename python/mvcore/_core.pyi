@@ -81,6 +81,7 @@ def fuse(
     depths: Sequence[_F32],
     weights: Sequence[_F32],
     silhouettes: Sequence[_F32] | None,
+    windows: Sequence[tuple[float, float, float, float]],
     projections: _F64,
     *,
     truncation: float,

@@ -14,7 +14,7 @@ from .cameras import Camera
 from .config import CarveConfig, VolumeConfig
 from .errors import ReconstructionError, require
 from .types import Bounds, DepthMap, Image, Report
-from .volume import SIDE, Volume, fuse
+from .volume import SIDE, Volume, Window, fuse
 
 Mask = NDArray[np.uint8]
 
@@ -127,8 +127,8 @@ EXPLAINED = 0.97
 def target_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Occupancy:
     """The hull in a box of its own, without the phantoms that few views cannot rule out.
 
-    Near few cameras, or outside most pictures, hardly anything speaks against a voxel. So as many cameras must see a voxel as the masks allow:
-    the most for which the hull still covers them.
+    Near few cameras, or outside most pictures, hardly anything speaks against a voxel. So as many cameras must see a voxel as the
+    masks allow: the most for which the hull still covers them.
     """
     counts = sorted({max(2, round(share * len(cameras))) for share in (1.0, 0.75, 0.5, 0.25)}, reverse=True)
     hulls = [_tight_hull(masks, cameras, bounds, config, least) for least in counts]
@@ -157,10 +157,13 @@ def _tight_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds
     return hull
 
 
-def supported(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig, tolerance: float) -> list[Mask]:
+def supported(
+    masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig, tolerance: float, least_views: int = 2
+) -> list[Mask]:
     """Per camera the pixels whose rays meet a voxel that the *other* cameras' masks support, (h, w) uint8 of 0 and 255.
 
-    All but the share ``tolerance`` of those that see it must. Foreground elsewhere is noise. All pixels where the others have nothing in common.
+    All but the share ``tolerance`` of those that see it must, and at least ``least_views`` must see it. Foreground elsewhere is noise.
+    Where the others have nothing in common, these are all pixels.
     """
     hull = target_hull(masks, cameras, bounds, config)
     box = np.asarray(bounds, np.float64)
@@ -173,7 +176,7 @@ def supported(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, 
     for n, camera in enumerate(cameras):
         others = [m for k, m in enumerate(grown) if k != n]
         theirs = [c for k, c in enumerate(cameras) if k != n]
-        least = min(2, len(others))
+        least = min(least_views, len(others))
         hull = carve_silhouettes(others, theirs, box, resolution=config.resolution, tolerance=tolerance, least_views=least)
         seen = shadow(hull, camera, 1.5)
         found.append(seen if seen.any() else np.full_like(seen, 255))
@@ -186,6 +189,7 @@ def visual_hull(
     bounds: Bounds,
     config: VolumeConfig | None = None,
     report: Report | None = None,
+    windows: Sequence[Window] | None = None,
 ) -> Volume:
     """The visual hull as a signed distance field with a sub-voxel surface (soft silhouettes), block-sparse.
 
@@ -193,7 +197,8 @@ def visual_hull(
     """
     config = config or VolumeConfig()
     nothing = [DepthMap(e, e) for e in (np.zeros((c.height, c.width), np.float32) for c in cameras)]
-    return fuse(nothing, cameras, bounds, masks, replace(config, solid_smoothing=config.smoothing), report)
+    coarse = replace(config, solid_smoothing=config.smoothing, footprints=config.hull_footprints)
+    return fuse(nothing, cameras, bounds, masks, coarse, report, windows)
 
 
 def _footprint(image: Image, pixels: float) -> tuple[Image, Image]:
@@ -276,4 +281,4 @@ def sparse_volume(field: NDArray[np.float32], origin: NDArray[np.float64], voxel
     blocks = whole.reshape(bx, SIDE, by, SIDE, bz, SIDE).transpose(0, 2, 4, 1, 3, 5)
     used = np.argwhere((blocks < 1).any((3, 4, 5)))
     values = np.ascontiguousarray(blocks[used[:, 0], used[:, 1], used[:, 2]], np.float32)
-    return Volume(np.asarray(origin, np.float64), voxel, (nx, ny, nz), used.astype(np.uint32), values)
+    return Volume(np.asarray(origin, np.float64), voxel, (nx, ny, nz), np.ascontiguousarray(used, np.uint32), values)

@@ -64,6 +64,18 @@ def _without(scene: Scene, excluded: list[int] | None) -> tuple[list[Any], list[
     return [scene.frames[n] for n in kept], [scene.calib[n] for n in kept], kept
 
 
+def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: int | None) -> dict[str, Any]:
+    """A configuration from the options that commands share."""
+    if max_image_size is not None and max_image_size < 16:
+        raise ValueError(f"--max-image-size: expected at least 16, got {max_image_size}")
+    settings: dict[str, Any] = {"matcher": matcher, "device": device}
+    if max_image_size is not None:
+        settings["depth"] = {"max_image_size": max_image_size}
+    if max_faces is not None:
+        settings["surface"] = {"max_faces": max_faces}
+    return settings
+
+
 Matcher = Annotated[str, typer.Option(help="Depth matcher: sgm (classical) or dcnn (the network).")]
 Device = Annotated[str, typer.Option(help="Where the network runs: cpu or cuda.")]
 
@@ -92,16 +104,10 @@ def reconstruct(
 
         if output.suffix.lower() not in FORMATS:
             raise ValueError(f"--output: expected a name ending in {', '.join(FORMATS)}, got {str(output)!r}")
-        if max_image_size is not None and max_image_size < 16:
-            raise ValueError(f"--max-image-size: expected at least 16, got {max_image_size}")
+        settings = _settings(matcher, device, max_image_size, max_faces)
         scene = load(path)
         frames, cameras, kept = _without(scene, _numbers("--exclude", exclude, kind=int))
         box = _numbers("--bounds", bounds, 6)
-        settings: dict[str, Any] = {"matcher": matcher, "device": device}
-        if max_image_size is not None:
-            settings["depth"] = {"max_image_size": max_image_size}
-        if max_faces is not None:
-            settings["surface"] = {"max_faces": max_faces}
         given = find_masks(masks, frames) if masks is not None else None
         if given is None and scene.masks is not None:
             print("masks lie beside the images; pass --masks to use them", file=sys.stderr)
@@ -119,6 +125,69 @@ def reconstruct(
         seconds = result.report["seconds"].values()
         cpu, wall = sum(s["cpu"] for s in seconds), sum(s["wall"] for s in seconds)
         print(f"{output}: {len(result.faces)} faces from {len(frames)} views, {wall:.0f} s ({cpu:.0f} CPU seconds)")
+
+
+@app.command()
+def video(
+    path: Annotated[Path, typer.Argument(help="A folder of clips: video files, or a folder of images a camera.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the meshes and their index.")],
+    calib: Annotated[Path | None, typer.Option(help="Calibration; by default what lies in the folder.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of mask clips, bright on the target; by default it is found.")] = None,
+    background: Annotated[str | None, typer.Option(help="Folder of clean plates; 'none' for the whole scene.")] = None,
+    regions: Annotated[Path | None, typer.Option(help="Folder of CAMERA.png, bright where targets may be (a road).")] = None,
+    bounds: Annotated[str | None, typer.Option(help="Box where targets are: x0,y0,z0,x1,y1,z1.")] = None,
+    start: Annotated[int, typer.Option(help="First instant.")] = 0,
+    stop: Annotated[int | None, typer.Option(help="Instant to stop before.")] = None,
+    stride: Annotated[int, typer.Option(help="Take every so manieth instant.")] = 1,
+    target: Annotated[str, typer.Option(help="free, or rigid: all instants make one model.")] = "free",
+    scheduler: Annotated[str | None, typer.Option(help="A dask.distributed scheduler, tcp://host:port.")] = None,
+    workdir: Annotated[Path | None, typer.Option(help="Keeps results; an interrupted run goes on there.")] = None,
+    max_image_size: Annotated[int | None, typer.Option(help="Reduce images to this many pixels on the longer side.")] = None,
+    max_faces: Annotated[int | None, typer.Option(help="Decimate each mesh to this many faces.")] = None,
+    matcher: Matcher = "sgm",
+    device: Device = "cpu",
+    debug: Debug = False,
+) -> None:
+    """Synchronised clips in, a textured mesh an instant out."""
+    with _one_line_errors(debug):
+        from .io import load_video
+        from .io.images import find_pictures
+        from .video import reconstruct_video
+
+        clips = load_video(path, calib, start=start, stop=stop, stride=stride)
+        settings = _settings(matcher, device, max_image_size, max_faces)
+        if scheduler is not None and workdir is None:
+            workdir = output / "work"  # a temporary folder would be this machine's alone
+        names = [c.name for c in clips.clips]
+        run = reconstruct_video(
+            clips,
+            masks=masks,
+            background=False if background == "none" else background,
+            regions=find_pictures(regions, names) if regions is not None else None,
+            bounds=_numbers("--bounds", bounds, 6),
+            target=target,
+            config=settings,
+            scheduler=scheduler,
+            workdir=workdir,
+            track=_Bars(),
+        )
+        run.save(output)
+        for warning in run.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
+        print(f"{output}: {len(run)} instants of {len(names)} cameras, {sum(run.seconds):.0f} s")
+
+
+@app.command()
+def view(
+    output: Annotated[Path, typer.Argument(help="Folder that 'mvcore video' wrote.")],
+    page: Annotated[Path | None, typer.Option(help="Page to write; by default view.html in the folder.")] = None,
+    debug: Debug = False,
+) -> None:
+    """One self-contained HTML page with a time slider, depth maps and the report."""
+    with _one_line_errors(debug):
+        from .viewer import write_page
+
+        print(write_page(output, page))
 
 
 @app.command()

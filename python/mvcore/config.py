@@ -96,6 +96,8 @@ class VolumeConfig:
     """World units; by default `footprints` pixel footprints of the target."""
     footprints: float = 1.35
     """Pixel footprints a voxel: below 1 there is nothing to resolve, above 1.5 detail is lost."""
+    hull_footprints: float = 3.0
+    """The same for a visual hull alone: silhouettes say little about detail."""
     truncation: float = 5.0
     """Voxels on either side of a surface that carry its distance."""
     free_weight: float = 0.3

@@ -28,7 +28,7 @@ from .result import Reconstruction
 from .surface import extract_surface
 from .texture import Given, texture
 from .types import Bounds, DepthMap, Frame, Image, Report, SparsePoints, Track, no_track
-from .volume import Volume, fuse
+from .volume import Volume, Window, fuse
 
 Masks = list[NDArray[np.uint8]]
 
@@ -143,11 +143,12 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class Views:
-    """Undistorted images of one instant, their masks (or None) and their cameras."""
+    """Undistorted images of one instant, their masks (or None) and their cameras; ``windows`` where they are cut from larger ones."""
 
     images: list[Image]
     masks: Masks | None
     cameras: list[Camera]
+    windows: list[Window] | None = None
 
     def view(self, n: int) -> View:
         """View ``n`` as the depth stage takes it."""
@@ -208,10 +209,10 @@ def build(
 def fuse_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: Config, report: Report) -> Volume:
     """The signed distance field of filtered depth maps; that of the visual hull where no view has sources but masks are given."""
     if not any(plan.sources) and views.masks is not None:
-        hull = visual_hull(views.masks, views.cameras, plan.box, config.volume, report)
+        hull = visual_hull(views.masks, views.cameras, plan.box, config.volume, report, views.windows)
         return photo_hull(hull, views.images, views.cameras, config.carve, report) if config.carve.photo_consistency else hull
     maps = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)]
-    return fuse(maps, views.cameras, plan.box, views.masks, config.volume, report)
+    return fuse(maps, views.cameras, plan.box, views.masks, config.volume, report, views.windows)
 
 
 def finish(

@@ -34,7 +34,8 @@ class Reconstruction:
 
     vertices : (V, 3) float64. faces : (F, 3) uint32, counter-clockwise from outside. uv : (V, 2) float32, origin
     bottom-left. texture : (h, w, 3) uint8. depths, confidences : a `DepthMap` a view (filtered), None where a view was left
-    out. face_views : (F,) int32, the photograph of each face, -1 where none sees it. cameras : the undistorted, possibly reduced cameras of the depth maps. report : figures that JSON can hold.
+    out. face_views : (F,) int32, the photograph of each face, -1 where none sees it. cameras : the undistorted, possibly
+    reduced cameras of the depth maps. report : figures that JSON can hold.
     """
 
     vertices: NDArray[np.float64]

@@ -25,13 +25,11 @@ class Background:
     """What a camera sees without the target.
 
     plate : (h, w, 3) uint8. known : (h, w) bool, where the plate is sure. region : (h, w) bool, where the target may appear at all.
-    learnt : the plate comes from the clip and may show parts of the target that never move.
     """
 
     plate: Image
     known: Bool
     region: Bool
-    learnt: bool = False
 
     @classmethod
     def from_plate(cls, plate: Image, road: Mask | None = None) -> Background:
@@ -104,19 +102,20 @@ def _large(mask: Mask, share: float) -> Mask:
     return (area >= max(16, share * area.max()))[part].astype(np.uint8)
 
 
-def _cut(image: Image, rough: Mask, background: Bool, doubtful: Bool | None, rounds: int) -> Mask:
-    """GrabCut around a rough mask (0 and 1): its border settles on the image's edges; colours decide what is ``doubtful``."""
+def _cut(image: Image, rough: Mask, background: Bool, unknown: Bool, rounds: int) -> Mask:
+    """GrabCut around a rough mask (0 and 1): its border settles on the image's edges; where nothing is known colours decide."""
     if not rough.any():
         return rough
-    y, x = np.nonzero(rough if doubtful is None else rough | doubtful)
+    y, x = np.nonzero(rough)
     pad = 24
     window = np.s_[max(0, y.min() - pad) : y.max() + pad, max(0, x.min() - pad) : x.max() + pad]
     inner, near = cv2.erode(rough, _disc(9)), cv2.dilate(rough, _disc(13))
     labels = np.where(rough > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[background | (near == 0)] = cv2.GC_BGD
-    labels[inner > 0] = cv2.GC_FGD
-    if doubtful is not None:
-        labels[doubtful & (rough == 0)] = cv2.GC_PR_FGD
+    labels[(inner > 0) & ~unknown] = cv2.GC_FGD
+    # Colours of the target are those of what surely differs; what is unknown starts as background if that is most of the mask.
+    if (unknown & (rough > 0)).sum() > 0.3 * np.count_nonzero(rough):
+        labels[unknown & (labels == cv2.GC_PR_FGD)] = cv2.GC_PR_BGD
     labels = np.ascontiguousarray(labels[window])
     # Colour models need both kinds.
     if not ((labels & 1) == 0).any() or not ((labels & 1) == 1).any():
@@ -135,7 +134,7 @@ def _at(background: Background, size: tuple[int, int]) -> Background:
     known, region = (
         cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for m in (background.known, background.region)
     )
-    return Background(cv2.resize(background.plate, size, interpolation=cv2.INTER_AREA), known, region, background.learnt)
+    return Background(cv2.resize(background.plate, size, interpolation=cv2.INTER_AREA), known, region)
 
 
 def foreground(
@@ -159,32 +158,28 @@ def foreground(
     """
     config, carving = config or TargetConfig(), carving or CarveConfig()
     require(len(images) == len(cameras) == len(backgrounds), "backgrounds", f"{len(images)}, one an image", len(backgrounds))
-    small, reduced, found = [], [], []
+    small, reduced, found, unknown = [], [], [], []
     for n, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         picture, at = reduce(image, camera, config.max_size)
         small.append(picture)
         reduced.append(at)
-        found.append(_evidence(picture, _at(backgrounds[n], (at.width, at.height)), config))
+        background = _at(backgrounds[n], (at.width, at.height))
+        found.append(_evidence(picture, background, config))
+        unknown.append(~background.known)
     rough = [_cleaned(e.changed.astype(np.uint8), config) for e in found]
     outside = [e.background for e in found]
-    doubtful: list[Bool | None] = [None] * len(images)
     if bounds is not None and len(images) > 2:
         # Masks grow a little first: what one camera misses by a pixel must not cost the others theirs.
-        grown = [cv2.dilate(r, _disc(7)) for r in rough]
-        learnt = any(b.learnt for b in backgrounds)
-        # A learnt plate may show a part of the target in one camera; the others must not lose it for that.
-        one = max(carving.tolerance, 1.01 / (len(images) - 1)) if learnt else carving.tolerance
-        seen = supported(grown, reduced, bounds, carving, one)
-        if learnt:  # and where all the others agree, that camera's colours decide
-            agreed = [s > 0 for s in supported(grown, reduced, bounds, carving, 0.0)]
-            doubtful = [a & b.learnt for a, b in zip(agreed, backgrounds, strict=True)]
-            outside = [o & ~a for o, a in zip(outside, agreed, strict=True)]
+        seen = supported([cv2.dilate(r, _disc(7)) for r in rough], reduced, bounds, carving, carving.tolerance)
         rough = [_large(r & (s > 0), config.least_part) for r, s in zip(rough, seen, strict=True)]
         outside = [o | (s == 0) for o, s in zip(outside, seen, strict=True)]
+    cuts = [
+        _large(_cut(p, r, o, u, config.cut_rounds), config.least_part) for p, r, o, u in zip(small, rough, outside, unknown, strict=True)
+    ]
     masks = []
-    for picture, r, o, d, image in zip(small, rough, outside, doubtful, images, strict=True):
-        mask = _large(_cut(picture, r, o, d, config.cut_rounds), config.least_part) * np.uint8(255)
+    for cut, image in zip(cuts, images, strict=True):
         h, w = image.shape[:2]
+        mask = cut * np.uint8(255)
         if mask.shape != (h, w):
             mask = np.where(cv2.resize(mask, (w, h), interpolation=cv2.INTER_LINEAR) > 127, 255, 0).astype(np.uint8)
         masks.append(mask)
@@ -194,34 +189,50 @@ def foreground(
 def learn_backgrounds(
     frames: Sequence[Sequence[Image]],
     cameras: Sequence[Camera],
+    bounds: Bounds | None = None,
     config: TargetConfig | None = None,
+    carving: CarveConfig | None = None,
     track: Track = no_track,
 ) -> list[Background]:
     """What stands behind a moving target, from samples of the clip without a clean plate.
 
     The plate is each pixel's most frequent colour. Where the target stays for most of the clip, that is the target itself: colours
-    learnt from what moves (GrabCut's mixtures) tell these places, which become unknown and count as target. OpenCV's MOG2 has a say
-    in what moves; it drops shadows.
+    learnt from what moves (GrabCut's mixtures) tell these places, and the cameras must agree on them; they become unknown and count as
+    target. OpenCV's MOG2 has a say in what moves; it drops shadows.
 
     Parameters
     ----------
     frames : (cameras, samples): undistorted (h, w, 3) uint8, spread over the clip.
+    bounds : (2, 3) world: where targets are.
 
     Returns
     -------
     One a camera, with the longer side at most ``config.max_size`` pixels.
     """
-    config = config or TargetConfig()
+    config, carving = config or TargetConfig(), carving or CarveConfig()
     require(all(len(f) >= 3 for f in frames), "frames", "at least 3 samples a camera", min(map(len, frames)))
-    found = []
+    plates, regions, ghosts, still, usual, reduced = [], [], [], [], [], []
     for samples, camera in track(zip(frames, cameras, strict=True), "background", len(cameras)):
-        large = np.stack([reduce(f, camera, config.max_size)[0] for f in samples])
-        small = np.stack([reduce(f, camera, config.learn_size)[0] for f in samples])
-        region = _moving(small, config)
-        ghost = _ghost(small, _commonest(small, config), region, config)
-        h, w = large.shape[1:3]
-        known, around = (cv2.resize(m, (w, h), interpolation=cv2.INTER_NEAREST) for m in (1 - ghost, _widened(region)))
-        found.append(Background(_commonest(large, config), known > 0, around > 0, learnt=True))
+        pairs = [reduce(f, camera, config.learn_size) for f in samples]
+        small = np.stack([p[0] for p in pairs])
+        plate, region = _commonest(small, config), _moving(small, config)
+        changed = np.stack([cv2.absdiff(s, plate).max(2) > 2 * config.threshold for s in small]).mean(0)
+        ghosts.append(_ghost(small, plate, region, config))
+        usual.append(((ghosts[-1] > 0) | (changed > 0.4)).astype(np.uint8))
+        still.append((changed < 0.4) & (_widened(region) > 0))
+        regions.append(_widened(region))
+        reduced.append(pairs[0][1])
+        plates.append(_commonest(np.stack([reduce(f, camera, config.max_size)[0] for f in samples]), config))
+    if bounds is not None and len(cameras) > 2:
+        # A place where the target usually is looks so to every camera; one that took it for background is overruled by all the others.
+        seen = supported([cv2.dilate(u, _disc(5)) for u in usual], reduced, bounds, carving, 0.0, len(cameras) - 1)
+        sure = [(s > 0) & s.any() & ~(s > 0).all() for s in seen]
+        ghosts = [((g > 0) | t) & s if s.any() else g > 0 for g, t, s in zip(ghosts, still, sure, strict=True)]
+    found = []
+    for plate, region, ghost in zip(plates, regions, ghosts, strict=True):
+        h, w = plate.shape[:2]
+        hidden, around = (cv2.resize(np.asarray(m, np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0 for m in (ghost, region))
+        found.append(Background(plate, ~hidden, around | hidden))
     return found
 
 

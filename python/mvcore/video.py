@@ -1,8 +1,8 @@
 """Multi-view video: a textured mesh an instant, or one model of a rigid target from all of them.
 
-The work is cut into pure functions of stored inputs (`_learn`, `_prepare`, `_first`, `_second`, `_fuse`, `_mesh`, and for a rigid target `_poses` and `_model...`). Each
-writes one entry of the `Store` under a key made of its inputs and settings, so that any executor may run it, twice if need be,
-and a run that was killed finds what it had finished.
+The work is cut into pure functions of stored inputs: `_learn`, `_prepare`, `_first`, `_second`, `_fuse`, `_mesh`, and for a rigid
+target `_poses` and the `_model` family. Each writes one entry of the `Store` under a key made of its inputs and settings, so that any
+executor may run it, twice if need be, and a run that was killed finds what it had finished.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .config import Config
 from .depth import RoughDepth, seeded_depth
 from .errors import ReconstructionError, require
 from .io.clips import Clips, Source, load_video
-from .io.images import read_image, reduce, undistort
+from .io.images import find_pictures, read_image, reduce, undistort
 from .motion import cloud_of, cloud_of_mesh, find_poses
 from .pipeline import Plan, Views, check_bounds, filter_views, finish, first_pass, fuse_views, second_pass
 from .result import Reconstruction
@@ -39,9 +39,9 @@ from .surface import marching_cubes
 from .target import Background, foreground, learn_backgrounds
 from .texture import Given
 from .types import Bounds, DepthMap, Image, Report, SparsePoints, Track, no_track
-from .volume import Volume
+from .volume import Volume, Window
 
-VERSION = 4
+VERSION = 8
 """Of the entries' content: results of other versions are not taken for one's own."""
 NO_POINTS = SparsePoints(np.zeros((0, 3)), np.zeros((0, 0), bool), np.zeros(0, np.float32))
 
@@ -75,8 +75,8 @@ class VideoReconstruction:
     """The instants of a clip, reconstructed as they are asked for; iterate once over it, or call `save`.
 
     model : after the last instant of a rigid target, one `Reconstruction` of all instants in the first one's frame.
-    trajectory : (T, 4, 4) float64, which bring the model into the world at each instant, NaN where the target is not seen. times : (T,) seconds;
-    names : of the cameras.
+    trajectory : (T, 4, 4) float64, which bring the model into the world at each instant, NaN where the target is not seen.
+    times : (T,) seconds; names : of the cameras.
     seconds : wall seconds of each instant; warnings : what the clips, the calibration and the run had to say.
     """
 
@@ -95,8 +95,9 @@ class VideoReconstruction:
         return self._instants
 
     def save(self, folder: str | Path) -> None:
-        """Write what is still to come into a folder: a GLB an instant and target, pictures of depth maps, for a rigid target the model, still
-        and animated, and ``index.json`` at last. Nothing of it stays in memory.
+        """Write what is still to come into a folder; nothing of it stays in memory.
+
+        A GLB an instant and target, pictures of depth maps, for a rigid target the model, still and animated, and at last ``index.json``.
         """
         writer = SequenceWriter(folder)
         for result in self:
@@ -220,24 +221,10 @@ def _by_camera(mapping: Mapping[str, Any], clips: Clips, label: str) -> list[Any
 
 def _plates(clips: Clips, background: Any) -> tuple[Image | None, ...]:
     if isinstance(background, str | Path):
-        background = _plate_files(Path(background), [c.name for c in clips.clips])
+        background = find_pictures(background, [c.name for c in clips.clips])
     given = [c.plate for c in clips.clips] if not isinstance(background, Mapping) else _by_camera(background, clips, "background")
     pictures = zip(given, clips.clips, clips.calib, strict=True)
     return tuple(None if g is None else _picture(g, camera, f"background of {clip.name}") for g, clip, camera in pictures)
-
-
-def _plate_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """``NAME.*`` or ``NAME/*`` of each camera in a folder."""
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of clean plates")
-    found = {}
-    for name in names:
-        files = sorted(
-            [*folder.glob(f"{name}.*"), *folder.glob(f"{name}/background.*"), *folder.glob(f"{name}/*.png"), *folder.glob(f"{name}/*.jpg")]
-        )
-        require(files, "background", f"a clean plate of every camera in {folder}", f"none of {name}")
-        found[name] = files[0]
-    return found
 
 
 def _regions(regions: Mapping[str, Any], clips: Clips) -> tuple[NDArray[np.uint8] | None, ...]:
@@ -262,8 +249,8 @@ def _content(source: Any, number: int) -> Any:
     return [_file_key(path, status.st_size, status.st_mtime_ns), number if isinstance(source, Path) else 0]
 
 
-def _frames_key(clips: Clips, instant: int) -> str:
-    return digest([_content(c.source, int(n)) for c, n in zip(clips.clips, clips.numbers[instant], strict=True)])
+def _frames_key(clips: Clips, numbers: NDArray[np.int64]) -> str:
+    return digest([_content(c.source, int(n)) for c, n in zip(clips.clips, numbers, strict=True)])
 
 
 def _base_key(job: Job) -> str:
@@ -273,10 +260,11 @@ def _base_key(job: Job) -> str:
     return digest("mvcore", VERSION, cameras, config, job.plates, job.roads, job.whole, job.bounds)
 
 
-def _samples(job: Job) -> list[int]:
-    """Instants that a background is learnt from."""
-    count = min(len(job.clips), job.config.target.samples)
-    return sorted({int(n) for n in np.linspace(0, len(job.clips) - 1, count).round()})
+def _samples(job: Job) -> NDArray[np.int64]:
+    """Frame numbers (samples, cameras) that a background is learnt from: of the whole clips, whatever part is reconstructed."""
+    line = job.clips.timeline
+    count = min(len(line), job.config.target.samples)
+    return line[sorted({int(n) for n in np.linspace(0, len(line) - 1, count).round()})]
 
 
 # --- pieces of work -----------------------------------------------------------------------------------------------------------------
@@ -318,18 +306,20 @@ def _learn(job: Job) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         missing = [n for n, p in enumerate(job.plates) if p is None]
         learnt: dict[int, Background] = {}
         if missing:
-            require(
-                len(job.clips) >= 3, "background", "a clean plate of every camera, or at least 3 instants to learn it from", len(job.clips)
-            )
             chosen = _samples(job)
-            frames = [[job.clips.undistorted(n, t) for t in chosen] for n in missing]
-            learnt = dict(zip(missing, learn_backgrounds(frames, [cameras[n] for n in missing], job.config.target), strict=True))
+            require(len(chosen) >= 3, "background", "a clean plate of every camera, or at least 3 instants to learn it from", len(chosen))
+            frames = [[job.clips.undistorted_frame(n, int(t)) for t in chosen[:, n]] for n in missing]
+            learnt = dict(
+                zip(
+                    missing, learn_backgrounds(frames, [cameras[n] for n in missing], box, job.config.target, job.config.carve), strict=True
+                )
+            )
         for n, plate in enumerate(job.plates):
             found = learnt[n] if plate is None else Background.from_plate(plate)
             road = job.roads[n]
             region = found.region if road is None else found.region & (_resized(road, found.region.shape) > 0)
             arrays |= {f"plate{n}": found.plate, f"known{n}": found.known, f"region{n}": region}
-    meta = {"report": report.values, "warnings": report.warnings, "learnt": [p is None for p in job.plates]}
+    meta = {"report": report.values, "warnings": report.warnings}
     return arrays, meta
 
 
@@ -360,10 +350,7 @@ def _prepare(job: Job, learn_key: str, instant: int) -> tuple[dict[str, NDArray[
         ]
     elif not job.whole:
         arrays = learnt.arrays
-        backgrounds = [
-            Background(arrays[f"plate{n}"], arrays[f"known{n}"], arrays[f"region{n}"], learnt.meta["learnt"][n])
-            for n in range(len(cameras))
-        ]
+        backgrounds = [Background(arrays[f"plate{n}"], arrays[f"known{n}"], arrays[f"region{n}"]) for n in range(len(cameras))]
         masks = foreground(images, cameras, backgrounds, around, config.target, config.carve)
     targets: list[dict[str, Any]] = []
     box = around
@@ -427,7 +414,7 @@ def _cropped(
     images: Sequence[Image], masks: Sequence[NDArray[np.uint8]], cameras: Sequence[Camera], hull: Occupancy, config: Config
 ) -> Views:
     """Each view cut to its mask and the hull's shadow in it, with a margin."""
-    pictures, cuts, kept = [], [], []
+    pictures, cuts, kept, windows = [], [], [], []
     for image, mask, camera in zip(images, masks, cameras, strict=True):
         y, x = np.nonzero((mask > 0) | (shadow(hull, camera) > 0))
         low, high = (np.array([x.min(), y.min()]), np.array([x.max(), y.max()]) + 1) if len(x) else (np.zeros(2, int), np.array([32, 32]))
@@ -440,7 +427,10 @@ def _cropped(
         pictures.append(picture)
         cuts.append(reduce(np.ascontiguousarray(mask[window]), part, limit, nearest=True)[0])
         kept.append(reduced)
-    return Views(pictures, cuts, kept)
+        scale = reduced.width / part.width
+        x, y = -low * scale
+        windows.append((float(x), float(y), float(x + (camera.width - 1) * scale), float(y + (camera.height - 1) * scale)))
+    return Views(pictures, cuts, kept, windows)
 
 
 def _plan(views: Views, points: SparsePoints, box: Bounds, bounded: bool, config: Config, report: Report) -> Plan:
@@ -477,6 +467,8 @@ def _view_arrays(views: Views, plan: Plan) -> dict[str, NDArray[Any]]:
     arrays |= {f"image{n}": i for n, i in enumerate(views.images)}
     arrays |= {f"mask{n}": m for n, m in enumerate(views.masks or [])}
     arrays["K"], arrays["R"], arrays["t"] = (np.stack([getattr(c, k) for c in views.cameras]) for k in "KRt")
+    if views.windows is not None:
+        arrays["windows"] = np.array(views.windows, np.float64)
     arrays |= {"points": plan.points.positions, "visible": plan.points.visible, "errors": plan.points.errors}
     return arrays
 
@@ -491,7 +483,8 @@ def _prepared(job: Job, key: str) -> tuple[Views, Plan, Entry]:
     cameras = [Camera(a["K"][n], a["R"][n], a["t"][n], images[n].shape[1], images[n].shape[0], name=names[n]) for n in range(count)]
     ranges = [(float(low), float(high)) for low, high in a["ranges"]]
     plan = Plan(SparsePoints(a["points"], a["visible"], a["errors"]), a["box"], ranges, entry.meta["sources"])
-    return Views(images, masks, cameras), plan, entry
+    windows = [tuple(w) for w in a["windows"].tolist()] if "windows" in a else None
+    return Views(images, masks, cameras, windows), plan, entry
 
 
 @_once
@@ -615,7 +608,9 @@ class _Run:
     def _instants(self, pool: Pool) -> Iterator[Reconstruction]:
         job, count = self.job, len(self.job.clips)
         base = _base_key(job)
-        seen = digest([_frames_key(job.clips, t) for t in _samples(job)])
+        # Without masks and plates the background depends on samples of the whole clips, else on the first instant alone.
+        looked = _samples(job) if job.masks is None and not job.whole and None in job.plates else job.clips.numbers[:1]
+        seen = digest([_frames_key(job.clips, numbers) for numbers in (job.clips.numbers[0], *looked)])
         learn_key = digest("learn", base, seen)
         pool.start(_learn, job, learn_key)()
         self.out.warnings += _get(job, learn_key).meta["warnings"]
@@ -770,8 +765,8 @@ class _Chain:
 
     def _start_preparing(self, t: int) -> tuple[str, Callable[[], Any]]:
         job = self.job
-        masks = None if job.masks is None else _frames_key(job.masks, t)
-        key = digest("prepare", self.learn_key, _frames_key(job.clips, t), masks)
+        masks = None if job.masks is None else _frames_key(job.masks, job.masks.numbers[t])
+        key = digest("prepare", self.learn_key, _frames_key(job.clips, job.clips.numbers[t]), masks)
         return key, self.pool.start(_prepare, job, key, self.learn_key, t)
 
     def _instant(self, t: int, prepared: tuple[str, Callable[[], Any]], before: _Done | None, gains: str | None) -> _Done:
@@ -836,13 +831,15 @@ def _gathered(job_folder: Path, prepare_keys: tuple[str, ...], poses_key: str, j
     images: list[Image] = []
     masks: list[NDArray[np.uint8]] = []
     cameras: list[Camera] = []
+    windows: list[Window] = []
     for key, pose in zip(prepare_keys, entry.arrays["poses"], strict=True):
         views, _, _ = _prepared(job.job, key)
         images += views.images
         masks += views.masks or []
         cameras += [c.moved(pose) for c in views.cameras]
-    plan = _plan(Views(images, masks, cameras), _no_points(len(cameras)), box, True, job.job.config, Report())
-    return Views(images, masks, cameras), plan
+        windows += views.windows or []
+    plan = _plan(Views(images, masks, cameras, windows), _no_points(len(cameras)), box, True, job.job.config, Report())
+    return Views(images, masks, cameras, windows), plan
 
 
 @dataclass(frozen=True, eq=False)

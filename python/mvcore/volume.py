@@ -15,6 +15,8 @@ from .config import VolumeConfig
 from .errors import ReconstructionError, require
 from .types import Bounds, DepthMap, Report
 
+Window = tuple[float, float, float, float]
+"""x0, y0, x1, y1 in pixels of an image that may be a part of what the camera saw."""
 SIDE = 8
 """Voxels along a block's side."""
 
@@ -129,6 +131,7 @@ def fuse(
     masks: Sequence[NDArray[np.uint8]] | None = None,
     config: VolumeConfig | None = None,
     report: Report | None = None,
+    windows: Sequence[Window] | None = None,
 ) -> Volume:
     """Fuse depth maps inside ``bounds``; with masks the field is carved to the visual hull and closed inside it.
 
@@ -137,6 +140,7 @@ def fuse(
     depths : one a camera, of the camera's size; weights are confidence times (target distance / z)⁴, as σz grows with z².
     bounds : (2, 3) world.
     masks : (h, w) uint8, non-zero on the target.
+    windows : what each camera saw, of which its masks may be a part cut out; by default the masks' own size.
 
     Raises
     ------
@@ -148,6 +152,7 @@ def fuse(
     voxel = target_voxel(cameras, depths, bounds, config)
     weights = [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)]
     silhouettes = None if masks is None else [silhouette_distance(m) for m in repaired_masks(depths, cameras, masks)]
+    seen = windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]
     wanted = voxel
     while True:
         origin = bounds[0] - 2 * voxel
@@ -160,6 +165,7 @@ def fuse(
                 [d.depth for d in depths],
                 weights,
                 silhouettes,
+                seen,
                 np.stack([c.projection for c in cameras]),
                 truncation=config.truncation * voxel,
                 free_weight=config.free_weight,

@@ -71,6 +71,7 @@ class Clips:
 
     calib : the cameras of the frames as they decode. numbers : (instants, cameras) the frame of each camera at each instant.
     times : seconds of each instant after the first camera's start, or frame numbers where no rate is known.
+    timeline : as ``numbers``, of all that the clips show together, also what start, stop and stride leave out.
     warnings : what does not fit: sizes, frame counts, rates.
     """
 
@@ -78,6 +79,7 @@ class Clips:
     calib: Calibration
     numbers: NDArray[np.int64]
     times: NDArray[np.float64]
+    timeline: NDArray[np.int64]
     warnings: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -89,7 +91,11 @@ class Clips:
 
     def undistorted(self, camera: int, instant: int) -> Image:
         """The frame that a pinhole with the camera's K would have taken."""
-        return undistort(np.ascontiguousarray(self.frame(camera, instant)), self.calib[camera])
+        return self.undistorted_frame(camera, int(self.numbers[instant, camera]))
+
+    def undistorted_frame(self, camera: int, number: int) -> Image:
+        """The same of a frame by its number in the clip."""
+        return undistort(np.ascontiguousarray(self.clips[camera].frame(number)), self.calib[camera])
 
     def __iter__(self) -> Iterator[Instant]:
         """The instants in order; a thread reads ahead, at most `AHEAD` of them are held."""
@@ -181,7 +187,7 @@ def load_video(
     if not len(chosen):
         raise InvalidInputError(f"start, stop: expected instants of 0 .. {len(numbers)}, got {start} .. {stop}")
     index = np.array(chosen)
-    return Clips(tuple(clips), Calibration(tuple(cameras)), numbers[index], times[index], tuple(warnings))
+    return Clips(tuple(clips), Calibration(tuple(cameras)), numbers[index], times[index], numbers, tuple(warnings))
 
 
 def _find_sources(folder: Path) -> dict[str, Source]:

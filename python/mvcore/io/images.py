@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..cameras import Camera
 from ..errors import FormatError, InvalidInputError, require
 from ..types import Frame, Image
-from .records import find_mask
+from .records import IMAGE_SUFFIXES, find_mask
 
 
 def read_image(path: str | Path) -> Image:
@@ -58,6 +58,27 @@ def find_masks(folder: str | Path, frames: Sequence[Frame]) -> list[Path]:
     if missing:
         raise FormatError(f"{folder}: no mask for {missing[0]} ({len(missing)} of {len(frames)} frames have none)")
     return [f for f in found if f is not None]
+
+
+def find_pictures(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
+    """One picture a camera in a folder: ``NAME.png`` (any image suffix), or the first, by name, in a folder ``NAME``.
+
+    Raises
+    ------
+    FileNotFoundError, FormatError
+        No such folder, or a camera without one.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder of pictures")
+    found = {}
+    for name in names:
+        inner = sorted((folder / name).iterdir()) if (folder / name).is_dir() else []
+        files = [f for f in [*sorted(folder.glob(f"{name}.*")), *inner] if f.suffix.lower() in IMAGE_SUFFIXES]
+        if not files:
+            raise FormatError(f"{folder}: no picture of camera {name}")
+        found[name] = files[0]
+    return found
 
 
 def load_frame(frame: Frame, camera: Camera, index: int) -> Image:

@@ -38,7 +38,7 @@ pub fn consistency<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, projections, *, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -47,6 +47,7 @@ pub fn fuse<'py>(
     depths: Vec<PyReadonlyArray2<'py, f32>>,
     weights: Vec<PyReadonlyArray2<'py, f32>>,
     silhouettes: Option<Vec<PyReadonlyArray2<'py, f32>>>,
+    windows: Vec<[f64; 4]>,
     projections: PyReadonlyArray3<'py, f64>,
     truncation: f64,
     free_weight: f32,
@@ -60,8 +61,8 @@ pub fn fuse<'py>(
     let silhouettes = silhouettes.as_ref().map(|s| rasters(s, "silhouettes")).transpose()?;
     let n = depths.len();
     let p = projections_of(&projections, n)?;
-    if weights.len() != n || silhouettes.as_ref().is_some_and(|s| s.len() != n) {
-        let text = format!("weights, silhouettes: expected {n} of each, as many as depths");
+    if weights.len() != n || windows.len() != n || silhouettes.as_ref().is_some_and(|s| s.len() != n) {
+        let text = format!("weights, silhouettes, windows: expected {n} of each, as many as depths");
         return Err(pyo3::exceptions::PyValueError::new_err(text));
     }
     let views: Vec<FusionView> = (0..n)
@@ -69,6 +70,7 @@ pub fn fuse<'py>(
             depth: depths[v],
             weight: weights[v],
             silhouette: silhouettes.as_ref().map(|s| s[v]),
+            window: windows[v],
             projection: p[v],
             focal: (p[v][0].powi(2) + p[v][1].powi(2) + p[v][2].powi(2)).sqrt().max(1e-9),
         })

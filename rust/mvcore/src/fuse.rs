@@ -27,6 +27,9 @@ pub struct FusionView<'a> {
     pub weight: Raster<'a, f32>,
     /// Signed distance to the silhouette in pixels, positive outside it.
     pub silhouette: Option<Raster<'a, f32>>,
+    /// What the camera saw, in pixels of the rasters: x0, y0, x1, y1. Larger than these where they are cut from a picture that shows
+    /// only background around them.
+    pub window: [f64; 4],
     /// P = K [R | t], row-major 3x4.
     pub projection: [f64; 12],
     /// Focal length in pixels, turns silhouette distances into world units.
@@ -187,16 +190,20 @@ fn hull_distance(p: [f64; 3], views: &[FusionView], tolerance: f32) -> f32 {
             continue;
         }
         let (u, v) = (q[0] / q[2], q[1] / q[2]);
-        let (w, h) = (silhouette.width as f64, silhouette.height as f64);
-        if u < 0.0 || v < 0.0 || u > w - 1.0 || v > h - 1.0 {
+        let [x0, y0, x1, y1] = view.window;
+        if u < x0 || v < y0 || u > x1 || v > y1 {
             continue;
         }
+        // Beyond the raster the silhouette is at least as far as the way to it.
+        let inside = (u.clamp(0.0, silhouette.width as f64 - 1.0), v.clamp(0.0, silhouette.height as f64 - 1.0));
+        let beyond = (u - inside.0).hypot(v - inside.1) as f32;
+        let (u, v) = inside;
         let (x, y) = (u as usize, v as usize);
         let (x1, y1) = ((x + 1).min(silhouette.width - 1), (y + 1).min(silhouette.height - 1));
         let (a, b) = ((u - x as f64) as f32, (v - y as f64) as f32);
         let at = |x: usize, y: usize| silhouette.data[y * silhouette.width + x];
         let pixels = (1.0 - b) * ((1.0 - a) * at(x, y) + a * at(x1, y)) + b * ((1.0 - a) * at(x, y1) + a * at(x1, y1));
-        outside[seen] = pixels * (q[2] / view.focal) as f32;
+        outside[seen] = (pixels + beyond) * (q[2] / view.focal) as f32;
         seen += 1;
     }
     // What few views see, few silhouettes can cut: it does not belong to a target that the rig looks at.
@@ -448,6 +455,7 @@ mod tests {
             depth: raster(&depth),
             weight: raster(&weight),
             silhouette: None,
+            window: [0.0, 0.0, 63.0, 63.0],
             projection: projection(),
             focal: 60.0,
         };
@@ -476,6 +484,7 @@ mod tests {
             depth: raster(&depth),
             weight: raster(&weight),
             silhouette: Some(raster(&outside)),
+            window: [0.0, 0.0, 63.0, 63.0],
             projection: projection(),
             focal: 60.0,
         };
@@ -496,6 +505,7 @@ mod tests {
             depth: raster(&depth),
             weight: raster(&weight),
             silhouette: None,
+            window: [0.0, 0.0, 63.0, 63.0],
             projection: projection(),
             focal: 60.0,
         };
