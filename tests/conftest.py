@@ -80,7 +80,8 @@ def render_target(camera: mvcore.Camera, pose=None):
         hit |= closer
     points = o + rays * s[:, None]
     own = points @ back[:3, :3].T + back[:3, 3]
-    image = np.where(hit[:, None], texture_of(own), texture_of(points * 0.7 + 3))
+    paint = (texture_of(own) * [0.55, 0.4, 0.25] + [110, 80, 10]).astype(np.uint8)  # orange, so that masks can be found
+    image = np.where(hit[:, None], paint, texture_of(points * 0.2 + 3) // 2 + 20)
     shape = (camera.height, camera.width)
     return image.reshape(*shape, 3), hit.reshape(shape)
 
@@ -110,7 +111,7 @@ def write_clips(folder: Path, cameras, poses, plates=True) -> Path:
 def rig(count=12, size=(160, 120)):
     """Cameras around the origin, all of which see a target of some size there."""
     angles = 2 * np.pi * np.arange(count) / count
-    focal = 0.94 * size[0]
+    focal = 1.3 * size[0]
     return [look_at((2.6 * np.cos(a), 2.6 * np.sin(a), 0.9 * (i % 2)), (0, 0, 0), size, focal) for i, a in enumerate(angles)]
 
 

@@ -10,9 +10,9 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from conftest import ROOT, write_scene
+from conftest import ROOT, rig, write_clips, write_scene
 
-EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if "nurbs" not in p.stem)
+EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if "nurbs" not in p.stem and "video" not in p.stem)
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +26,14 @@ def test_an_example_runs(path, small, tmp_path):
     suffix = ".ply" if "step" in path.stem else ".glb"
     subprocess.run([sys.executable, str(path), str(small), str(tmp_path / f"a{suffix}")], check=True, capture_output=True)
     assert (tmp_path / f"a{suffix}").stat().st_size > 1000
+
+
+def test_the_video_example_saves_its_instants(tmp_path):
+    write_clips(tmp_path / "clips", rig(6, (120, 90)), [np.eye(4)] * 2)
+    command = [sys.executable, str(ROOT / "examples" / "05_video.py"), str(tmp_path / "clips"), str(tmp_path / "out")]
+    out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert out.count("visual hull") == 2
+    assert (tmp_path / "out" / "0001.glb").stat().st_size > 1000
 
 
 def test_the_nurbs_example_draws_a_picture(tmp_path):
@@ -45,7 +53,7 @@ def test_the_descent_example_gains_by_moving_knots(tmp_path):
     assert (tmp_path / "a.obj").is_file()
 
 
-@pytest.mark.parametrize("module", ["cameras", "config", "depth", "surface"])
+@pytest.mark.parametrize("module", ["cameras", "carve", "config", "depth", "io.clips", "surface"])
 def test_docstrings(module):
     result = doctest.testmod(importlib.import_module(f"mvcore.{module}"), extraglobs={"np": np})
     assert result.attempted > 0

@@ -609,7 +609,7 @@ class _Run:
         job, count = self.job, len(self.job.clips)
         base = _base_key(job)
         # Without masks and plates the background depends on samples of the whole clips, else on the first instant alone.
-        looked = _samples(job) if job.masks is None and not job.whole and None in job.plates else job.clips.numbers[:1]
+        looked = _samples(job) if job.masks is None and not job.whole and any(p is None for p in job.plates) else job.clips.numbers[:1]
         seen = digest([_frames_key(job.clips, numbers) for numbers in (job.clips.numbers[0], *looked)])
         learn_key = digest("learn", base, seen)
         pool.start(_learn, job, learn_key)()
