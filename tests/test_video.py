@@ -378,3 +378,19 @@ def test_different_content_has_different_keys(value, data):
     )
     same = repr(value) == repr(other)
     assert (digest(value) == digest(other)) == same
+
+
+def test_a_frame_that_vanishes_is_an_error_not_a_wait(tmp_path):
+    write_clips(tmp_path, rig(12), POSES[:3])
+    clips = load_video(tmp_path)
+    (tmp_path / "images" / "cam03" / "frame0001.png").unlink()
+    run = iter(reconstruct_video(clips, config=SETTINGS))
+    next(run)
+    with pytest.raises(FileNotFoundError, match=r"frame0001\.png"):
+        next(run)
+
+
+def test_a_run_that_is_dropped_ends(folder):
+    run = iter(reconstruct_video(load_video(folder), config=SETTINGS | {"video": {"segment": 1}}))
+    next(run)
+    run.close()

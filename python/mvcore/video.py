@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +27,7 @@ from .cameras import Calibration, Camera
 from .carve import Occupancy, shadow, target_hull
 from .config import Config
 from .depth import RoughDepth, seeded_depth
-from .errors import ReconstructionError, require
+from .errors import MvcoreError, ReconstructionError, require
 from .io.clips import Clips, Source, load_video
 from .io.images import find_pictures, read_image, reduce, undistort
 from .motion import cloud_of, cloud_of_mesh, find_poses
@@ -745,16 +746,22 @@ class _Chain:
     def run(self, instants: range, done: dict[int, Future[_Done]]) -> None:
         """Sets each instant's future; an error fails it and all that follow it."""
         before: _Done | None = None
-        ready = self._start_preparing(instants[0])
+        ready: tuple[str, Callable[[], Any]] | None = None
         for t in instants:
             if self.stopped:
+                for later in instants:
+                    done[later].cancel()  # another chain may be waiting for it
                 return
             try:
-                prepared = ready
+                prepared = ready or self._start_preparing(t)
+                ready = None
                 if t + 1 in instants:
-                    ready = self._start_preparing(t + 1)
-                # Colours are settled once a clip, at its first instant with a target.
+                    with suppress(OSError, MvcoreError):  # what is wrong with the next instant is told in its turn
+                        ready = self._start_preparing(t + 1)
+                # Colours are settled once a clip, at its first instant; without a target there, where the chain first sees one.
                 gains = None if t == 0 else done[0].result().mesh
+                if gains is None and before is not None:
+                    gains = before.mesh
                 before = self._instant(t, prepared, before, gains)
                 done[t].set_result(before)
             except BaseException as error:
