@@ -2,8 +2,8 @@
 
     python benches/peers.py [--middlebury DIR]
 
-Peers: OpenCV's StereoSGBM, Open3D's TSDF volume, VTK's FlyingEdges, scikit-image's Marching Cubes; those that are not installed
-are left out. Threads: as the environment sets them (RAYON_NUM_THREADS, OMP_NUM_THREADS).
+Peers: OpenCV's StereoSGBM, Open3D's TSDF volume and silhouette carving, NumPy, VTK's FlyingEdges, scikit-image's Marching Cubes; those
+that are not installed are left out. Threads: as the environment sets them (RAYON_NUM_THREADS, OMP_NUM_THREADS).
 """
 
 import argparse
@@ -105,6 +105,61 @@ def fusion():
     line("Open3D ScalableTSDFVolume", seconds, ours, error(np.asarray(tsdf.extract_triangle_mesh().vertices)))
 
 
+def lumps(c, balls):
+    """Silhouette of some balls, (h, w) uint8."""
+    rays = np.concatenate([c.pixel_grid(), np.ones((c.height, c.width, 1))], -1).reshape(-1, 3) @ np.linalg.inv(c.K).T @ c.R
+    inside = np.zeros(len(rays), bool)
+    for center, radius in balls:
+        to = c.center - center
+        inside |= (rays @ to) ** 2 - (rays**2).sum(1) * (to @ to - radius**2) > 0
+    return np.ascontiguousarray(inside.reshape(c.height, c.width).astype(np.uint8) * 255)
+
+
+def numpy_carving(origin, voxel, n, masks, cameras):
+    """The votes of all views on all voxels, vectorised."""
+    axis = [o + voxel * np.arange(n) for o in origin]
+    points = np.stack(np.meshgrid(*axis, indexing="ij"), -1).reshape(-1, 3)
+    seen, against = np.zeros(len(points), np.uint8), np.zeros(len(points), np.uint8)
+    for mask, c in zip(masks, cameras):
+        q = points @ c.projection[:, :3].T + c.projection[:, 3]
+        x = np.rint(q[:, :2] / q[:, 2:]).astype(np.int32)
+        inside = (q[:, 2] > 0) & (x >= 0).all(1) & (x[:, 0] < c.width) & (x[:, 1] < c.height)
+        seen += inside
+        against[inside] += mask[x[inside, 1], x[inside, 0]] == 0
+    return ((seen >= 1) & (against == 0)).reshape(n, n, n)
+
+
+def carving():
+    print("carving, 24 silhouettes 640 x 480 into 256^3")
+    rng = np.random.default_rng(0)
+    balls = [(rng.uniform(-0.6, 0.6, 3), rng.uniform(0.2, 0.5)) for _ in range(9)]
+    cameras = [camera(k, 24) for k in range(24)]
+    masks = [lumps(c, balls) for c in cameras]
+    n, origin, voxel = 256, [-1.13, -1.11, -1.12], 2.2 / 255
+    p = np.stack([c.projection for c in cameras])
+    ours, hull = median(lambda: _core.carve(origin, voxel, [n] * 3, masks, p, tolerance=0.0, least_views=1))
+    line("mvcore carve", ours, ours)
+    seconds, theirs = median(lambda: numpy_carving(origin, voxel, n, masks, cameras), 1)
+    line("NumPy, vectorised", seconds, ours, f"{(hull != theirs).sum()} of {hull.size} voxels differ")
+    try:
+        import open3d as o3d
+    except ImportError:
+        return
+
+    def carve():
+        grid = o3d.geometry.VoxelGrid.create_dense(np.array(origin) - voxel / 2, np.zeros(3), voxel, n * voxel, n * voxel, n * voxel)
+        for mask, c in zip(masks, cameras):
+            view = o3d.camera.PinholeCameraParameters()
+            k = c.K
+            view.intrinsic = o3d.camera.PinholeCameraIntrinsic(c.width, c.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+            view.extrinsic = np.vstack([np.column_stack([c.R, c.t]), [0, 0, 0, 1]])
+            grid.carve_silhouette(o3d.geometry.Image((mask > 0).astype(np.float32)), view, False)
+        return grid
+
+    seconds, grid = median(carve, 1)
+    line("Open3D carve_silhouette", seconds, ours, f"{len(grid.get_voxels())} voxels, ours {hull.sum()}")
+
+
 def surfaces():
     print("Marching Cubes, sphere in 512 x 512 x 512")
     axis = np.arange(512, dtype=np.float32) - 255.5
@@ -174,6 +229,7 @@ def main():
     arguments = parser.parse_args()
     aggregation()
     fusion()
+    carving()
     surfaces()
     if arguments.middlebury:
         middlebury(arguments.middlebury)

@@ -32,10 +32,10 @@ class Background:
     region: Bool
 
     @classmethod
-    def from_plate(cls, plate: Image, road: Mask | None = None) -> Background:
-        """From a clean plate; ``road`` (non-zero where targets may be) is a region of interest."""
+    def from_plate(cls, plate: Image) -> Background:
+        """From a clean plate: known everywhere."""
         everywhere = np.ones(plate.shape[:2], bool)
-        return cls(plate, everywhere, everywhere if road is None else road > 0)
+        return cls(plate, everywhere, everywhere)
 
 
 def _disc(side: int) -> Mask:
