@@ -71,6 +71,13 @@ def test_phantoms_that_few_views_see_are_left_out():
     assert shadow(hull, cameras[0]).any()
 
 
+def test_more_views_than_votes_fit_into_a_byte(silhouettes):
+    cameras, masks = silhouettes
+    few, many = (target_hull(masks * k, cameras * k, BOX, CarveConfig(resolution=32)) for k in (1, 25))
+    boxes = [h.origin + h.voxel * np.stack([np.argwhere(h.occupied).min(0), np.argwhere(h.occupied).max(0)]) for h in (few, many)]
+    assert np.abs(boxes[0] - boxes[1]).max() < 2 * few.voxel
+
+
 def test_dense_and_sparse_hold_the_same(silhouettes):
     cameras, masks = silhouettes
     volume = visual_hull(masks, cameras, BOX, VolumeConfig(voxel=0.05))

@@ -120,6 +120,8 @@ def _grown(mask: Mask, camera: Camera, bounds: Bounds, voxel: float) -> Mask:
     return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)))
 
 
+MOST_VIEWS = 255
+"""Views that `carve_silhouettes` takes."""
 EXPLAINED = 0.97
 """Share of what the fullest hull shows of the masks that a smaller one must show."""
 
@@ -130,6 +132,9 @@ def target_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds
     Near few cameras, or outside most pictures, hardly anything speaks against a voxel. So as many cameras must see a voxel as the
     masks allow: the most for which the hull still covers them.
     """
+    if len(masks) > MOST_VIEWS:  # the kernel counts votes in bytes; so many views spread evenly say the same of a box
+        chosen = np.linspace(0, len(masks) - 1, MOST_VIEWS).round().astype(int)
+        masks, cameras = [masks[n] for n in chosen], [cameras[n] for n in chosen]
     counts = sorted({max(2, round(share * len(cameras))) for share in (1.0, 0.75, 0.5, 0.25)}, reverse=True)
     hulls = [_tight_hull(masks, cameras, bounds, config, least) for least in counts]
     covered = [_covered(h, masks, cameras) for h in hulls]
