@@ -11,6 +11,7 @@
 
 use crate::error::{Error, Result, require};
 use crate::grid::{BLOCK, BlockMap, Grid, SIDE};
+use crate::hull::{cut_block, restrict_to_hull};
 use crate::memory::zeroed;
 use crate::raster::Raster;
 use crate::smooth::smooth;
@@ -160,61 +161,6 @@ impl Rays {
     }
 }
 
-/// Unmarks blocks outside the hull and marks all those inside it.
-fn restrict_to_hull(grid: &Grid, views: &[FusionView], params: &FusionParams, flags: &[AtomicBool]) {
-    let dims = grid.blocks();
-    let half = 0.5 * SIDE as f64;
-    let radius = (half * grid.voxel * 3f64.sqrt()) as f32;
-    flags.par_iter().enumerate().for_each(|(index, flag)| {
-        let (i, rest) = (index / (dims[1] * dims[2]), index % (dims[1] * dims[2]));
-        let corner = [i, rest / dims[2], rest % dims[2]];
-        let p = std::array::from_fn(|a| grid.origin[a] + grid.voxel * (corner[a] as f64 * SIDE as f64 + half));
-        // A block on the border of the hull lies within its radius of it.
-        flag.store(hull_distance(p, views, params.hull_tolerance) < radius * 1.2, Ordering::Relaxed);
-    });
-}
-
-const MAX_SILHOUETTES: usize = 256;
-
-/// Signed distance to the visual hull (positive outside), to first order near its surface; the views' vote.
-fn hull_distance(p: [f64; 3], views: &[FusionView], tolerance: f32) -> f32 {
-    let mut outside = [f32::MIN; MAX_SILHOUETTES];
-    let (mut seen, mut silhouettes) = (0, 0);
-    for view in views.iter().take(MAX_SILHOUETTES) {
-        let Some(silhouette) = &view.silhouette else { continue };
-        silhouettes += 1;
-        let m = &view.projection;
-        let q: [f64; 3] =
-            std::array::from_fn(|r| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3]);
-        if q[2] <= 0.0 {
-            continue;
-        }
-        let (u, v) = (q[0] / q[2], q[1] / q[2]);
-        let [x0, y0, x1, y1] = view.window;
-        if u < x0 || v < y0 || u > x1 || v > y1 {
-            continue;
-        }
-        // Beyond the raster the silhouette is at least as far as the way to it.
-        let inside = (u.clamp(0.0, silhouette.width as f64 - 1.0), v.clamp(0.0, silhouette.height as f64 - 1.0));
-        let beyond = (u - inside.0).hypot(v - inside.1) as f32;
-        let (u, v) = inside;
-        let (x, y) = (u as usize, v as usize);
-        let (x1, y1) = ((x + 1).min(silhouette.width - 1), (y + 1).min(silhouette.height - 1));
-        let (a, b) = ((u - x as f64) as f32, (v - y as f64) as f32);
-        let at = |x: usize, y: usize| silhouette.data[y * silhouette.width + x];
-        let pixels = (1.0 - b) * ((1.0 - a) * at(x, y) + a * at(x1, y)) + b * ((1.0 - a) * at(x, y1) + a * at(x1, y1));
-        outside[seen] = (pixels + beyond) * (q[2] / view.focal) as f32;
-        seen += 1;
-    }
-    // What few views see, few silhouettes can cut: it does not belong to a target that the rig looks at.
-    if seen == 0 || 2 * seen < silhouettes {
-        return f32::MAX;
-    }
-    let allowed = ((seen as f32 * tolerance) as usize).min(seen - 1);
-    let (_, &mut nth, _) = outside[..seen].select_nth_unstable_by(allowed, |a, b| b.total_cmp(a));
-    nth
-}
-
 /// One view as f32 increments over a block: homogeneous pixel of voxel (i, j, k) = base + i·di + j·dj + k·dk.
 struct Stepper {
     base: [f32; 3],
@@ -340,7 +286,7 @@ fn integrate(
         };
     }
     if masked {
-        cut_by_hull(grid, at, views, params, out);
+        cut_block(grid, at, views, params, out);
     }
 }
 
@@ -411,17 +357,6 @@ fn sample(view: &FusionView, u: f32, v: f32, z: f32, inverse_truncation: f32) ->
     let (a, b) = (u.max(0.0) - x0 as f32, v.max(0.0) - y0 as f32);
     let top = p + a * (q - p);
     (top + b * (r + a * (s - r) - top), weight)
-}
-
-fn cut_by_hull(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionParams, out: &mut [f32]) {
-    let inverse = (1.0 / params.truncation) as f32;
-    for (n, v) in out.iter_mut().enumerate() {
-        let local = [n / (SIDE * SIDE), n / SIDE % SIDE, n % SIDE];
-        let p =
-            std::array::from_fn(|a| grid.origin[a] + grid.voxel * (f64::from(at[a]) * SIDE as f64 + local[a] as f64));
-        let hull = hull_distance(p, views, params.hull_tolerance);
-        *v = v.max((hull * inverse).clamp(-1.0, 1.0));
-    }
 }
 
 #[cfg(test)]

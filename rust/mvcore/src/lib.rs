@@ -15,6 +15,7 @@ pub mod error;
 pub mod files;
 pub mod fuse;
 pub mod grid;
+pub mod hull;
 pub mod isosurface;
 pub mod level;
 pub mod match_epipolar;
