@@ -215,7 +215,7 @@ def test_marching_cubes_equals_the_sparse_form_and_stays_inside(shape, seed):
     padded[: shape[0], : shape[1], : shape[2]] = values
     coords = np.ascontiguousarray(np.argwhere(np.ones(blocks, bool)), np.uint32)
     cut = padded.reshape(blocks[0], 8, blocks[1], 8, blocks[2], 8).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 8, 8, 8)
-    sparse_vertices, sparse_faces = _core.isosurface_sparse(list(blocks), coords, np.ascontiguousarray(cut))
+    sparse_vertices, sparse_faces = _core.isosurface_sparse(coords, np.ascontiguousarray(cut))
     assert (sparse_vertices == vertices).all()
     assert (sparse_faces == faces).all()
 

@@ -200,10 +200,14 @@ def visual_hull(
 
     Parameters and errors as of `mvcore.volume.fuse`.
     """
-    config = config or VolumeConfig()
-    nothing = [DepthMap(e, e) for e in (np.zeros((c.height, c.width), np.float32) for c in cameras)]
-    coarse = replace(config, solid_smoothing=config.smoothing, footprints=config.hull_footprints)
+    nothing, coarse = hull_alone(cameras, config or VolumeConfig())
     return fuse(nothing, cameras, bounds, masks, coarse, report, windows)
+
+
+def hull_alone(cameras: Sequence[Camera], config: VolumeConfig) -> tuple[list[DepthMap], VolumeConfig]:
+    """What fusion takes for the hull of silhouettes without depth."""
+    nothing = [DepthMap(e, e) for e in (np.zeros((c.height, c.width), np.float32) for c in cameras)]
+    return nothing, replace(config, solid_smoothing=config.smoothing, footprints=config.hull_footprints)
 
 
 def _footprint(image: Image, pixels: float) -> tuple[Image, Image]:

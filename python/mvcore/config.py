@@ -202,8 +202,6 @@ class VideoConfig:
     """Share of a target's silhouette box added around it before the frames are cropped."""
     stereo_angle: float = 40.0
     """Degrees between a view and its nearest neighbour, in the median, beyond which stereo cannot work and the hull is the result."""
-    doubt: float = 0.5
-    """1 - ZNCC above which a pixel started from the surface before it is in doubt."""
     least_target: float = 0.1
     """Parts of the hull with a smaller share of the largest part's volume are no targets."""
     model_instants: int = 16

@@ -27,11 +27,15 @@ Map = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class View:
-    """An undistorted grey image, (h, w) uint8, with its camera; the network wants the colours, (h, w, 3) uint8, as well."""
+    """An undistorted grey image, (h, w) uint8, with its camera; the network wants the colours, (h, w, 3) uint8, as well.
+
+    ``mask``, (h, w) uint8, is non-zero where depth is wanted; elsewhere, but for a margin, it is not looked for on the fine scales.
+    """
 
     grey: Grey
     camera: Camera
     colour: NDArray[np.uint8] | None = None
+    mask: NDArray[np.uint8] | None = None
 
     def at(self, width: int, height: int) -> View:
         """The view reduced to another size."""
@@ -74,12 +78,13 @@ def _upsample(planes: Map, width: int, height: int) -> Map:
 
 @dataclass(frozen=True)
 class _Scale:
-    """One size of the problem: images (reference first), relative maps there (S, 12) and back, the slope limit."""
+    """One size of the problem: images (reference first), relative maps there (S, 12) and back, the slope limit, where depth is unwanted."""
 
     greys: list[Grey]
     there: Map
     back: Map
     max_slope: float
+    unwanted: NDArray[np.bool_] | None = None
 
 
 LEAST_CONFIDENCE = 0.1
@@ -129,20 +134,34 @@ class _Hypotheses:
     step: float
 
 
-def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig) -> _Hypotheses:
-    """Sweep, aggregate, refine at one scale."""
+def _aggregated(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig) -> tuple[Map, Map]:
+    """Inverse depth and margin of the semi-global solution among ``planes`` planes."""
     inverse = np.linspace(low, high, planes, dtype=np.float32)
-    step = float(inverse[1] - inverse[0])
     costs = _core.sweep(scale.greys[0], scale.greys[1:], scale.there, inverse)
     index, margin = _core.aggregate(costs, scale.greys[0], config.p1, config.p2, config.p2_falloff)
-    del costs
-    return _around(scale, (low + index * step).astype(np.float32), margin, (low, high), step, config)
+    return (low + index * float(inverse[1] - inverse[0])).astype(np.float32), margin
+
+
+def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig) -> _Hypotheses:
+    """Sweep, aggregate, refine at one scale."""
+    prior, margin = _aggregated(scale, low, high, planes, config)
+    return _around(scale, prior, margin, (low, high), (high - low) / (planes - 1), config)
+
+
+def _start(inverse: Map) -> Map:
+    """Slanted planes (h, w, 4) through a map of inverse depths."""
+    a, b = _slopes(inverse)
+    return np.stack([inverse, a, b, np.zeros_like(a)], -1)
 
 
 def _around(scale: _Scale, prior: Map, margin: Map, span: tuple[float, float], step: float, config: DepthConfig) -> _Hypotheses:
     """Slanted planes refined around a first solution."""
-    a, b = _slopes(prior)
-    start = np.stack([prior, a, b, np.zeros_like(a)], -1)
+    return _refined(scale, _start(prior), prior, margin, span, step, config)
+
+
+def _refined(
+    scale: _Scale, start: Map, prior: Map, margin: Map, span: tuple[float, float], step: float, config: DepthConfig
+) -> _Hypotheses:
     refined = _refine(scale, start, prior, span, step, config.sweep_rounds, config, config.prior_reach)
     return _Hypotheses(refined, prior, margin, span, step)
 
@@ -152,6 +171,9 @@ def _finer(coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig,
     h, w = scale.greys[0].shape
     planes = coarse.planes if coarse.planes.shape[:2] == (h, w) else _upsample(coarse.planes, w, h)
     prior = cv2.resize(coarse.prior, (w, h), interpolation=cv2.INTER_LINEAR)
+    if scale.unwanted is not None:
+        planes, prior = planes.copy(), np.where(scale.unwanted, np.float32(0), prior)
+        planes[scale.unwanted] = 0
     # One pixel of parallax is half as much inverse depth on an image twice as large.
     ratio = coarse.prior.shape[1] / w
     planes = _refine(scale, planes, prior, coarse.span, coarse.step * ratio, rounds, config, config.prior_reach / ratio, depths)
@@ -167,8 +189,19 @@ def _pyramid(reference: View, sources: Sequence[View], config: DepthConfig) -> l
         there = np.stack([relative_map(mine.camera, s.camera) for s in theirs])
         back = np.stack([relative_map(s.camera, mine.camera) for s in theirs])
         slope = float(np.tan(np.radians(config.max_slant)) / mine.camera.K[0, 0])
-        scales.append(_Scale([mine.grey, *(s.grey for s in theirs)], there, back, slope))
+        scales.append(_Scale([mine.grey, *(s.grey for s in theirs)], there, back, slope, _unwanted(reference.mask, w, h)))
     return scales
+
+
+MARGIN = 12
+"""Pixels around a mask in which depth is looked for as well: what is found there spreads inwards."""
+
+
+def _unwanted(mask: NDArray[np.uint8] | None, width: int, height: int) -> NDArray[np.bool_] | None:
+    if mask is None:
+        return None
+    inside = cv2.resize((mask > 0).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return cv2.dilate(inside, np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)) == 0
 
 
 def _check(sources: Sequence[View], near: float, far: float) -> None:
@@ -229,12 +262,11 @@ def seeded_depth(
     far: float,
     seed: Map,
     config: DepthConfig | None = None,
-    doubt: float = 0.5,
 ) -> RoughDepth:
-    """First pass that starts from a depth map expected here, an earlier instant's surface say, instead of sweeping.
+    """First pass that starts from a depth map expected here, an earlier instant's surface say.
 
-    Where more than a tenth of the seeded pixels correlate worse than ``1 - doubt``, the view is swept as well, and each pixel takes the
-    better of the two. Parameters and errors as of `sweep_depth`.
+    The sweep has half as many planes then: each pixel starts from what is expected unless the photographs speak for what the sweep found.
+    Parameters and errors as of `sweep_depth`.
 
     Parameters
     ----------
@@ -251,12 +283,14 @@ def seeded_depth(
         return sweep_depth(reference, sources, near, far, config)
     inverse = np.clip(1 / _filled(start), 1 / far, 1 / near).astype(np.float32)
     span, step = (1 / far, 1 / near), (1 / near - 1 / far) / (config.planes - 1)
-    found = _around(coarsest, inverse, np.full((h, w), 0.25, np.float32), span, step, config)
-    if (found.planes[..., 3][expected] > doubt).mean() > 0.1:
-        swept = _sweep(coarsest, *span, config.planes, config)
-        better = swept.planes[..., 3] < found.planes[..., 3]
-        merged = [np.where(better, a, b) for a, b in ((swept.prior, found.prior), (swept.margin, found.margin))]
-        found = replace(swept, planes=np.where(better[..., None], swept.planes, found.planes), prior=merged[0], margin=merged[1])
+    margin = np.full((h, w), 0.25, np.float32)
+    planes = max(2, config.planes // 2)
+    swept, sweep_margin = _aggregated(coarsest, *span, planes, config)
+    one, two = (_start(p) for p in (inverse, swept))
+    costs = [_refine(coarsest, s, p, span, step, 0, config, config.prior_reach)[..., 3] for s, p in ((one, inverse), (two, swept))]
+    better = ~expected | (costs[1] < costs[0])
+    prior = np.where(better, swept, inverse)
+    found = _refined(coarsest, np.where(better[..., None], two, one), prior, np.where(better, sweep_margin, margin), span, step, config)
     for scale in finer[:-1]:
         found = _finer(found, scale, config.rounds, config)
     return RoughDepth(found)
@@ -355,6 +389,7 @@ def _depth_map(planes: Map, margin: Map) -> DepthMap:
     depth = np.where(inverse > 0, 1.0 / np.maximum(inverse, 1e-30), 0).astype(np.float32)
     # ZNCC as likelihood, lifted where the aggregation found a clear winner.
     confidence = np.clip((1.0 - cost) * (0.5 + 0.5 * np.clip(4 * margin, 0, 1)), LEAST_CONFIDENCE, 1.0)
+    confidence[depth <= 0] = 0
     return DepthMap(depth, confidence.astype(np.float32))
 
 

@@ -18,17 +18,17 @@ from numpy.typing import ArrayLike, NDArray
 from . import depth as depth_stage
 from . import sparse as sparse_stage
 from .cameras import Calibration, Camera
-from .carve import photo_hull, target_hull, visual_hull
+from .carve import hull_alone, photo_hull, target_hull, visual_hull
 from .config import CarveConfig, Config, DepthConfig
 from .depth import View
 from .errors import ReconstructionError, require
 from .io import load
 from .io.images import find_masks, load_frame, load_mask, reduce, undistort
 from .result import Reconstruction
-from .surface import extract_surface
+from .surface import Surface, cleaned, isosurface
 from .texture import Given, texture
 from .types import Bounds, DepthMap, Frame, Image, Report, SparsePoints, Track, no_track
-from .volume import Volume, Window, fuse
+from .volume import Volume, Window, fuse_tiles
 
 Masks = list[NDArray[np.uint8]]
 
@@ -152,7 +152,8 @@ class Views:
 
     def view(self, n: int) -> View:
         """View ``n`` as the depth stage takes it."""
-        return View(cv2.cvtColor(self.images[n], cv2.COLOR_RGB2GRAY), self.cameras[n], self.images[n])
+        mask = None if self.masks is None else self.masks[n]
+        return View(cv2.cvtColor(self.images[n], cv2.COLOR_RGB2GRAY), self.cameras[n], self.images[n], mask)
 
 
 @dataclass(frozen=True)
@@ -202,36 +203,41 @@ def build(
         fused = filter_views(views, plan, depths, config.depth.loosened(), track)
         _say_kept(filtered, plan.sources, views.masks is not None, report)
     with clock.stage("volume"):
-        volume = fuse_views(views, plan, fused, config, report)
-    return finish(views, plan, filtered, volume, config, report, track, clock, given)
+        found = isosurface(fuse_views(views, plan, fused, config, report))
+    return finish(views, plan, filtered, found, config, report, track, clock, given)
 
 
-def fuse_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: Config, report: Report) -> Volume:
-    """The signed distance field of filtered depth maps; that of the visual hull where no view has sources but masks are given."""
-    if not any(plan.sources) and views.masks is not None:
+def fuse_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: Config, report: Report) -> Iterator[Volume]:
+    """The signed distance field of filtered depth maps, in parts; of the visual hull where no view has sources but masks are given."""
+    if any(plan.sources) or views.masks is None:
+        maps, settings = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)], config.volume
+    elif config.carve.photo_consistency:
         hull = visual_hull(views.masks, views.cameras, plan.box, config.volume, report, views.windows)
-        return photo_hull(hull, views.images, views.cameras, config.carve, report) if config.carve.photo_consistency else hull
-    maps = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)]
-    return fuse(maps, views.cameras, plan.box, views.masks, config.volume, report, views.windows)
+        yield photo_hull(hull, views.images, views.cameras, config.carve, report)
+        return
+    else:
+        maps, settings = hull_alone(views.cameras, config.volume)
+    yield from fuse_tiles(maps, views.cameras, plan.box, views.masks, settings, report, views.windows)
 
 
 def finish(
     views: Views,
     plan: Plan,
     filtered: list[DepthMap | None],
-    volume: Volume,
+    found: Surface,
     config: Config,
     report: Report,
     track: Track = no_track,
     clock: _Clock | None = None,
     given: Given | None = None,
 ) -> Reconstruction:
-    """From the field to the textured mesh."""
+    """From the isosurface found in the field to the textured mesh; the report knows the field's voxel."""
     clock = clock or _Clock(Report())
     with clock.stage("surface"):
-        surface = extract_surface(volume, config.surface, solid=views.masks is not None)
+        surface = cleaned(found, config.surface, solid=views.masks is not None)
     with clock.stage("texture"):
-        textured = texture(surface, views.images, views.cameras, views.masks, volume.voxel, config.texture, report, track, given or Given())
+        voxel = report.values["volume"]["voxel"]
+        textured = texture(surface, views.images, views.cameras, views.masks, voxel, config.texture, report, track, given or Given())
     report.values["mesh"] = {"vertices": len(textured.vertices), "faces": len(textured.faces)}
     report.values["texture"]["gains"] = textured.gains.tolist()
     report.values["bounds"] = plan.box.tolist()

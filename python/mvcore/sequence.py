@@ -37,8 +37,10 @@ class SequenceWriter:
         """One instant: ``parts`` are its targets, one or more; ``names`` those of the cameras."""
         number = int(result.report["instant"])
         files = []
-        for n, part in enumerate(parts if len(result.faces) else ()):
-            name = f"instant{number:04d}.glb" if len(parts) == 1 else f"instant{number:04d}_target{n}.glb"
+        for part in parts if len(result.faces) else ():
+            target = int(part.report.get("target", 0))
+            # A target keeps its number through the clip; a clip of one target does not bother anybody with it.
+            name = f"instant{number:04d}.glb" if len(parts) == 1 and target == 0 else f"instant{number:04d}_target{target}.glb"
             part.save(self.folder / name)
             files.append(name)
         pictures = {}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from . import _core
 from .config import SurfaceConfig
 from .errors import ReconstructionError, require
-from .volume import Volume
+from .volume import SIDE, Volume
 
 Float = NDArray[np.float64]
 Faces = NDArray[np.uint32]
@@ -48,24 +50,54 @@ def marching_cubes(values: NDArray[np.float32], level: float = 0.0) -> tuple[NDA
     return _core.isosurface_dense(shifted)
 
 
-def isosurface(volume: Volume) -> Surface:
-    """The surface of a block-sparse field in world coordinates."""
-    vertices, faces = _core.isosurface_sparse(list(volume.blocks), volume.coords, volume.values)
-    return Surface(volume.origin + volume.voxel * vertices.astype(np.float64), faces)
+def isosurface(volume: Volume | Iterable[Volume]) -> Surface:
+    """The surface of a block-sparse field in world coordinates; parts of one (`mvcore.volume.fuse_tiles`) are joined.
+
+    Vertices on a layer that two parts share are equal to the bit in both, and become one.
+    """
+    points, faces, count = [], [], 0
+    grid: Volume | None = None
+    for part in [volume] if isinstance(volume, Volume) else volume:
+        grid = part
+        p, f = _core.isosurface_sparse(part.coords, part.values)
+        points.append(p)
+        faces.append(f + np.uint32(count))
+        count += len(p)
+    require(grid is not None, "volume", "one part or more", "none")
+    assert grid is not None
+    vertices, triangles = np.concatenate(points), np.concatenate(faces)
+    if len(points) > 1:
+        vertices, triangles = _joined(vertices, triangles)
+    return Surface(grid.origin + grid.voxel * vertices.astype(np.float64), triangles)
 
 
-def extract_surface(volume: Volume, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
-    """Isosurface, small parts dropped, then smoothed and decimated as configured.
+def _joined(vertices: NDArray[np.float32], faces: Faces) -> tuple[NDArray[np.float32], Faces]:
+    """One vertex where parts have one each: vertices of a single part never coincide."""
+    shared = np.flatnonzero((vertices % SIDE == 0).any(1))
+    rows = np.ascontiguousarray(vertices[shared]).view(np.dtype((np.void, 12))).ravel()
+    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
+    owner = np.arange(len(vertices), dtype=np.uint32)
+    owner[shared] = shared[first[number]]
+    return _used(vertices, owner[faces])
 
-    ``solid`` says that the field is closed (silhouettes were given): bubbles inside it are dropped too.
+
+def extract_surface(volume: Volume | Iterable[Volume], config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
+    """Isosurface of a field or its parts, then `cleaned`.
 
     Raises
     ------
     ReconstructionError
         The field has no surface.
     """
+    return cleaned(isosurface(volume), config, solid)
+
+
+def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
+    """Small parts dropped, then smoothed and decimated as configured.
+
+    ``solid`` says that the surface is closed (silhouettes were given): bubbles inside it are dropped too. Errors as of `extract_surface`.
+    """
     config = config or SurfaceConfig()
-    surface = isosurface(volume)
     if not len(surface.faces):
         raise ReconstructionError("the depth maps agree on no surface inside the bounds")
     if solid:
@@ -79,10 +111,15 @@ def extract_surface(volume: Volume, config: SurfaceConfig | None = None, solid: 
 
 
 def _compact(vertices: Float, faces: Faces) -> Surface:
+    return Surface(*_used(vertices, faces))
+
+
+def _used(vertices: NDArray[Any], faces: Faces) -> tuple[NDArray[Any], Faces]:
+    """The vertices that faces have, and the faces with their new numbers."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.uint32) - 1
-    return Surface(vertices[used], number[faces].astype(np.uint32))
+    return vertices[used], number[faces].astype(np.uint32)
 
 
 def drop_small_parts(surface: Surface, share: float) -> Surface:

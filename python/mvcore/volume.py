@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -124,6 +124,92 @@ def _repaired(mask: NDArray[np.uint8], camera: Camera, points: list[NDArray[np.f
     return filled | (cv2.morphologyEx(filled, cv2.MORPH_CLOSE, small) & around)
 
 
+@dataclass(frozen=True)
+class _Fusion:
+    """What `_core.fuse` takes, checked and converted."""
+
+    depths: list[NDArray[np.float32]]
+    weights: list[NDArray[np.float32]]
+    silhouettes: list[NDArray[np.float32]] | None
+    windows: list[Window]
+    projections: NDArray[np.float64]
+    bounds: Bounds
+    config: VolumeConfig
+    voxel: float
+
+    @classmethod
+    def of(
+        cls,
+        depths: Sequence[DepthMap],
+        cameras: Sequence[Camera],
+        bounds: Bounds,
+        masks: Sequence[NDArray[np.uint8]] | None,
+        config: VolumeConfig,
+        windows: Sequence[Window] | None,
+    ) -> _Fusion:
+        bounds = np.asarray(bounds, np.float64)
+        return cls(
+            [d.depth for d in depths],
+            [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
+            None if masks is None else [silhouette_distance(m) for m in repaired_masks(depths, cameras, masks)],
+            list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
+            np.stack([c.projection for c in cameras]),
+            bounds,
+            config,
+            target_voxel(cameras, depths, bounds, config),
+        )
+
+    def grid(self, voxel: float) -> Volume:
+        """An empty volume of this voxel size around the bounds."""
+        nx, ny, nz = (int(n) for n in np.ceil((self.bounds[1] - self.bounds[0]) / voxel) + 5)
+        nothing = np.zeros((0, 3), np.uint32), np.zeros((0, SIDE, SIDE, SIDE), np.float32)
+        return Volume(self.bounds[0] - 2 * voxel, voxel, (nx, ny, nz), *nothing)
+
+    def run(self, grid: Volume, tile: list[list[int]] | None = None) -> Volume:
+        """The field, or the blocks from tile[0] up to tile[1]; MemoryError beyond ``max_memory``."""
+        config = self.config
+        coords, values = _core.fuse(
+            grid.origin.tolist(),
+            grid.voxel,
+            list(grid.shape),
+            self.depths,
+            self.weights,
+            self.silhouettes,
+            self.windows,
+            self.projections,
+            tile=tile,
+            truncation=config.truncation * grid.voxel,
+            free_weight=config.free_weight,
+            min_weight=config.min_weight,
+            solid_weight=config.solid_share * len(self.depths),
+            smoothing=config.smoothing if self.silhouettes is None else config.solid_smoothing,
+            hull_tolerance=config.hull_tolerance,
+            max_memory=config.max_memory,
+        )
+        return replace(grid, coords=coords, values=values)
+
+    def tiles(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
+        """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
+        # A block more on every side for the smoothing, and one at the far side, of which the last cells take their samples.
+        wide = [np.maximum(low - 1, 0).tolist(), np.minimum(high + 2, grid.blocks).tolist()]
+        try:
+            found = self.run(grid, wide)
+        except MemoryError as error:
+            axis = int((high - low).argmax())
+            if high[axis] - low[axis] < 2:
+                raise ReconstructionError(f"max_memory = {self.config.max_memory} bytes is too little for a volume: {error}") from None
+            middle = (low[axis] + high[axis]) // 2
+            yield from self.tiles(grid, low, np.where(np.arange(3) == axis, middle, high))
+            yield from self.tiles(grid, np.where(np.arange(3) == axis, middle, low), high)
+            return
+        kept = ((found.coords >= low) & (found.coords <= high)).all(1)
+        coords, values = found.coords[kept], found.values[kept]
+        for axis in range(3):
+            seam = coords[:, axis] == high[axis]
+            np.moveaxis(values, axis + 1, 1)[seam, 1:] = np.nan
+        yield replace(grid, coords=coords, values=values)
+
+
 def fuse(
     depths: Sequence[DepthMap],
     cameras: Sequence[Camera],
@@ -134,6 +220,8 @@ def fuse(
     windows: Sequence[Window] | None = None,
 ) -> Volume:
     """Fuse depth maps inside ``bounds``; with masks the field is carved to the visual hull and closed inside it.
+
+    The whole field is one volume: beyond ``config.max_memory`` its voxels grow. `fuse_tiles` keeps them.
 
     Parameters
     ----------
@@ -148,42 +236,54 @@ def fuse(
         Nothing lies inside the bounds.
     """
     config, report = config or VolumeConfig(), report or Report()
-    bounds = np.asarray(bounds, np.float64)
-    voxel = target_voxel(cameras, depths, bounds, config)
-    weights = [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)]
-    silhouettes = None if masks is None else [silhouette_distance(m) for m in repaired_masks(depths, cameras, masks)]
-    seen = windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]
-    wanted = voxel
+    job = _Fusion.of(depths, cameras, bounds, masks, config, windows)
+    voxel = job.voxel
     while True:
-        origin = bounds[0] - 2 * voxel
-        nx, ny, nz = (int(n) for n in np.ceil((bounds[1] - bounds[0]) / voxel) + 5)
         try:
-            coords, values = _core.fuse(
-                origin.tolist(),
-                voxel,
-                [nx, ny, nz],
-                [d.depth for d in depths],
-                weights,
-                silhouettes,
-                seen,
-                np.stack([c.projection for c in cameras]),
-                truncation=config.truncation * voxel,
-                free_weight=config.free_weight,
-                min_weight=config.min_weight,
-                solid_weight=config.solid_share * len(cameras),
-                smoothing=config.smoothing if masks is None else config.solid_smoothing,
-                hull_tolerance=config.hull_tolerance,
-                max_memory=config.max_memory,
-            )
+            volume = job.run(job.grid(voxel))
             break
         except MemoryError:
             voxel *= 1.2
-    if voxel > wanted:
-        report.warn(f"voxels grew from {wanted:.4g} to {voxel:.4g} to stay within max_memory = {config.max_memory} bytes")
-    if not len(coords):
+    if voxel > job.voxel:
+        report.warn(f"voxels grew from {job.voxel:.4g} to {voxel:.4g} to stay within max_memory = {config.max_memory} bytes")
+    _say(volume, [(len(volume.coords), volume.values.nbytes)] if len(volume.coords) else [], report)
+    return volume
+
+
+def fuse_tiles(
+    depths: Sequence[DepthMap],
+    cameras: Sequence[Camera],
+    bounds: Bounds,
+    masks: Sequence[NDArray[np.uint8]] | None = None,
+    config: VolumeConfig | None = None,
+    report: Report | None = None,
+    windows: Sequence[Window] | None = None,
+) -> Iterator[Volume]:
+    """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out.
+
+    Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone: `mvcore.surface.isosurface`
+    joins their surfaces to that of the whole. Parameters and errors as of `fuse`.
+    """
+    config, report = config or VolumeConfig(), report or Report()
+    job = _Fusion.of(depths, cameras, bounds, masks, config, windows)
+    grid = job.grid(job.voxel)
+
+    def told() -> Iterator[Volume]:
+        parts = []
+        for part in job.tiles(grid, np.zeros(3, np.int64), np.array(grid.blocks)):
+            if len(part.coords):
+                parts.append((len(part.coords), part.values.nbytes))
+                yield part
+        _say(grid, parts, report)
+
+    return told()
+
+
+def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
+    if not parts:
         raise ReconstructionError("no surface lies inside the bounds: check the bounds, the masks and the depth maps")
-    report.values["volume"] = {"voxel": voxel, "shape": [nx, ny, nz], "blocks": len(coords), "bytes": values.nbytes}
-    return Volume(origin, voxel, (nx, ny, nz), coords, values)
+    blocks, most = sum(p[0] for p in parts), max(p[1] for p in parts)
+    report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
 
 
 def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:

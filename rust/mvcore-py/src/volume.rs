@@ -4,7 +4,7 @@ use crate::convert::{array, map_of, raster, rasters, run, slice};
 use mvcore::carve::{CarveParams, Silhouette};
 use mvcore::consistency::{ConsistencyParams, OtherView};
 use mvcore::fuse::{FusionParams, FusionView};
-use mvcore::grid::{BlockMap, Grid, SIDE};
+use mvcore::grid::{BlockMap, Grid, SIDE, Tile};
 use mvcore::isosurface::Surface;
 use mvcore::photo_carve::{Photo, PhotoParams};
 use numpy::{PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4};
@@ -38,7 +38,7 @@ pub fn consistency<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -49,6 +49,7 @@ pub fn fuse<'py>(
     silhouettes: Option<Vec<PyReadonlyArray2<'py, f32>>>,
     windows: Vec<[f64; 4]>,
     projections: PyReadonlyArray3<'py, f64>,
+    tile: Option<[[usize; 3]; 2]>,
     truncation: f64,
     free_weight: f32,
     min_weight: f32,
@@ -77,7 +78,11 @@ pub fn fuse<'py>(
         .collect();
     let params =
         FusionParams { truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory };
-    let volume = run(py, || mvcore::fuse::fuse(Grid::new(origin, voxel, shape)?, &views, &params))?;
+    let volume = run(py, || {
+        let grid = Grid::new(origin, voxel, shape)?;
+        let tile = tile.map_or(Tile::whole(&grid), |[low, high]| Tile { low, high });
+        mvcore::fuse::fuse_tile(grid, tile, &views, &params)
+    })?;
     let count = volume.map.coords.len();
     Ok((
         array(py, volume.map.coords.into_flattened(), [count, 3])?,
@@ -160,13 +165,12 @@ pub fn isosurface_dense<'py>(py: Python<'py>, values: PyReadonlyArray3<'py, f32>
 #[pyfunction]
 pub fn isosurface_sparse<'py>(
     py: Python<'py>,
-    blocks: [usize; 3],
     coords: PyReadonlyArray2<'py, u32>,
     values: PyReadonlyArray4<'py, f32>,
 ) -> PyResult<Triangles<'py>> {
     let samples = slice(&values, "values")?;
     let coords = slice(&coords, "coords")?.as_chunks::<3>().0.to_vec();
-    let kernel = || mvcore::isosurface::isosurface_sparse(&BlockMap::from_coords(blocks, coords)?, samples);
+    let kernel = || mvcore::isosurface::isosurface_sparse(&BlockMap::from_coords(coords)?, samples);
     triangles(py, run(py, kernel)?)
 }
 

@@ -10,8 +10,8 @@
 //! order: the same bytes for any thread count.
 
 use crate::error::{Error, Result, require};
-use crate::grid::{BLOCK, BlockMap, Grid, SIDE};
-use crate::hull::{cut_block, restrict_to_hull};
+use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
+use crate::hull::{SoftSilhouette, cut_block, restrict_to_hull};
 use crate::memory::zeroed;
 use crate::raster::Raster;
 use crate::smooth::smooth;
@@ -35,6 +35,13 @@ pub struct FusionView<'a> {
     pub projection: [f64; 12],
     /// Focal length in pixels, turns silhouette distances into world units.
     pub focal: f64,
+}
+
+impl<'a> FusionView<'a> {
+    fn soft_silhouette(&self) -> Option<SoftSilhouette<'a>> {
+        let Self { window, projection, focal, .. } = *self;
+        self.silhouette.map(|distance| SoftSilhouette { distance, window, projection, focal })
+    }
 }
 
 /// How views become a field.
@@ -70,6 +77,14 @@ const VOXEL_BYTES: usize = 4;
 
 /// Fuses the views into the blocks near their surfaces (with silhouettes: also all blocks inside the hull).
 pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<Volume> {
+    fuse_tile(grid, Tile::whole(&grid), views, params)
+}
+
+/// The same for the blocks of a tile; those on its sides lack what smoothing takes from beyond them.
+pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionParams) -> Result<Volume> {
+    let dims = grid.blocks();
+    let fits = (0..3).all(|a| tile.low[a] < tile.high[a] && tile.high[a] <= dims[a]);
+    require(fits, "tile", format!("a box of blocks within {dims:?}"), format!("{:?} to {:?}", tile.low, tile.high))?;
     require(!views.is_empty(), "views", "at least one view", "none")?;
     require(params.truncation > 0.0, "truncation", "a positive distance", params.truncation)?;
     for view in views {
@@ -81,21 +96,21 @@ pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<V
             format!("{} x {}", view.weight.height, view.weight.width),
         )?;
     }
-    let dims = grid.blocks();
-    let count = dims.iter().product::<usize>();
+    let count = tile.count();
     let table = count.saturating_mul(5);
     if table > params.max_memory {
         return Err(Error::OutOfMemory { what: "block table", needed: table, allowed: params.max_memory });
     }
     let flags: Vec<AtomicBool> = (0..count).map(|_| AtomicBool::new(false)).collect();
     for view in views {
-        mark_surface(&grid, view, params.truncation, &flags);
+        mark_surface(&grid, &tile, view, params.truncation, &flags);
     }
-    let masked = views.iter().any(|v| v.silhouette.is_some());
+    let silhouettes: Vec<SoftSilhouette> = views.iter().filter_map(FusionView::soft_silhouette).collect();
+    let masked = !silhouettes.is_empty();
     if masked {
-        restrict_to_hull(&grid, views, params, &flags);
+        restrict_to_hull(&grid, &tile, &silhouettes, params.hull_tolerance, &flags);
     }
-    let map = BlockMap::from_flags(dims, flags.iter().map(|f| f.load(Ordering::Relaxed)));
+    let map = BlockMap::from_flags(tile, flags.iter().map(|f| f.load(Ordering::Relaxed)));
     let needed = map.coords.len() * BLOCK * VOXEL_BYTES + table;
     if needed > params.max_memory {
         return Err(Error::OutOfMemory { what: "volume", needed, allowed: params.max_memory });
@@ -104,6 +119,9 @@ pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<V
     let tiles: Vec<Tiles> = views.par_iter().map(|v| Tiles::of(v.depth)).collect();
     values.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).for_each(|(out, at)| {
         integrate(&grid, *at, views, &tiles, params, masked, out);
+        if masked {
+            cut_block(&grid, *at, &silhouettes, params.hull_tolerance, params.truncation, out);
+        }
     });
     if params.smoothing > 0.0 {
         // With silhouettes what no block covers is outside the hull.
@@ -113,8 +131,7 @@ pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<V
 }
 
 /// Marks the blocks within τ of a view's surface, walking each pixel's ray.
-fn mark_surface(grid: &Grid, view: &FusionView, truncation: f64, flags: &[AtomicBool]) {
-    let dims = grid.blocks();
+fn mark_surface(grid: &Grid, tile: &Tile, view: &FusionView, truncation: f64, flags: &[AtomicBool]) {
     let block = grid.voxel * SIDE as f64;
     let rays = Rays::of(&view.projection);
     (0..view.depth.height).into_par_iter().for_each(|y| {
@@ -133,8 +150,9 @@ fn mark_surface(grid: &Grid, view: &FusionView, truncation: f64, flags: &[Atomic
                 let along = f64::from(z) - reach + 2.0 * reach * f64::from(s) / f64::from(steps);
                 let p: [f64; 3] = std::array::from_fn(|a| rays.center[a] + direction[a] * along - grid.origin[a]);
                 let b = p.map(|v| (v / block).floor());
-                if (0..3).all(|a| b[a] >= 0.0 && b[a] < dims[a] as f64) {
-                    let index = (b[0] as usize * dims[1] + b[1] as usize) * dims[2] + b[2] as usize;
+                if b.iter().all(|&v| v >= 0.0)
+                    && let Some(index) = tile.index(b.map(|v| v as usize))
+                {
                     flags[index].store(true, Ordering::Relaxed);
                 }
             }
@@ -285,9 +303,6 @@ fn integrate(
             f32::NAN
         };
     }
-    if masked {
-        cut_block(grid, at, views, params, out);
-    }
 }
 
 #[inline(always)]
@@ -430,6 +445,39 @@ mod tests {
         };
         assert!(value(20, 20, 20) < -0.9);
         assert!(value(20, 29, 20) > 0.0); // 0.45 to the side: 6.75 px
+    }
+
+    #[test]
+    fn a_tile_holds_what_the_whole_holds() {
+        let depth: Vec<f32> = (0..64 * 64).map(|i| 4.0 + 0.3 * ((i % 64) as f32 * 0.4).sin()).collect();
+        let weight = vec![1.0f32; 64 * 64];
+        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
+        let view = FusionView {
+            depth: raster(&depth),
+            weight: raster(&weight),
+            silhouette: None,
+            window: [0.0, 0.0, 63.0, 63.0],
+            projection: projection(),
+            focal: 60.0,
+        };
+        let params = FusionParams { smoothing: 1.5, ..PARAMS };
+        let grid = Grid::new([-1.0; 3], 0.03, [67; 3]).unwrap();
+        let whole = fuse(grid, &[view], &params).unwrap();
+        let part = fuse_tile(grid, Tile { low: [2, 1, 0], high: [7, 6, 9] }, &[view], &params).unwrap();
+        let mut inner = 0;
+        for (c, block) in part.map.coords.iter().zip(part.values.chunks_exact(BLOCK)) {
+            // One block from the tile's sides all that smoothing reads is there.
+            if (3..6).contains(&c[0]) && (2..5).contains(&c[1]) && c[2] < 9 {
+                let slot = whole.map.at(c[0] as usize, c[1] as usize, c[2] as usize) as usize;
+                let same =
+                    whole.values[slot * BLOCK..][..BLOCK].iter().zip(block).all(|(a, b)| a.to_bits() == b.to_bits());
+                assert!(same, "{c:?}");
+                inner += 1;
+            }
+        }
+        assert!(inner > 10);
+        let wrong = Tile { low: [0; 3], high: [10, 9, 9] };
+        assert!(fuse_tile(grid, wrong, &[view], &params).unwrap_err().to_string().starts_with("tile"));
     }
 
     #[test]

@@ -38,12 +38,52 @@ impl Grid {
     }
 }
 
-/// Which blocks of a grid exist, in ascending order of their coordinates, and where each one's samples lie.
+/// A box of blocks, ends excluded: the whole of a grid, or a tile of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Tile {
+    /// First block along each axis.
+    pub low: [usize; 3],
+    /// Block after the last.
+    pub high: [usize; 3],
+}
+
+impl Tile {
+    /// All blocks of a grid.
+    pub fn whole(grid: &Grid) -> Self {
+        Self { low: [0; 3], high: grid.blocks() }
+    }
+
+    /// Blocks along each axis.
+    pub fn dims(&self) -> [usize; 3] {
+        std::array::from_fn(|a| self.high[a] - self.low[a])
+    }
+
+    /// Blocks in it.
+    pub fn count(&self) -> usize {
+        self.dims().iter().product()
+    }
+
+    /// Coordinates of a block by its number, C order.
+    pub fn block(&self, index: usize) -> [usize; 3] {
+        let [_, y, z] = self.dims();
+        [self.low[0] + index / (y * z), self.low[1] + index / z % y, self.low[2] + index % z]
+    }
+
+    /// Number of a block, none outside.
+    #[inline(always)]
+    pub fn index(&self, block: [usize; 3]) -> Option<usize> {
+        let inside = (0..3).all(|a| block[a] >= self.low[a] && block[a] < self.high[a]);
+        let [_, y, z] = self.dims();
+        inside.then(|| ((block[0] - self.low[0]) * y + block[1] - self.low[1]) * z + block[2] - self.low[2])
+    }
+}
+
+/// Which blocks of a tile exist, in ascending order of their coordinates in the grid, and where each one's samples lie.
 #[derive(Debug, Clone)]
 pub struct BlockMap {
-    /// Blocks along each axis.
-    pub dims: [usize; 3],
-    /// Slot of each block of the grid, or [`NONE`].
+    /// The blocks that may exist.
+    pub tile: Tile,
+    /// Slot of each block of the tile, or [`NONE`].
     pub slot: Vec<u32>,
     /// Block coordinates of each slot.
     pub coords: Vec<[u32; 3]>,
@@ -51,36 +91,39 @@ pub struct BlockMap {
 
 impl BlockMap {
     /// From one flag a block (C order).
-    pub fn from_flags(dims: [usize; 3], flags: impl Iterator<Item = bool>) -> Self {
-        let mut slot = vec![NONE; dims[0] * dims[1] * dims[2]];
+    pub fn from_flags(tile: Tile, flags: impl Iterator<Item = bool>) -> Self {
+        let mut slot = vec![NONE; tile.count()];
         let mut coords = Vec::new();
         for (index, _) in flags.enumerate().filter(|(_, on)| *on) {
             slot[index] = coords.len() as u32;
-            let (i, rest) = (index / (dims[1] * dims[2]), index % (dims[1] * dims[2]));
-            coords.push([i as u32, (rest / dims[2]) as u32, (rest % dims[2]) as u32]);
+            coords.push(tile.block(index).map(|v| v as u32));
         }
-        Self { dims, slot, coords }
+        Self { tile, slot, coords }
     }
 
     /// From block coordinates in ascending order.
-    pub fn from_coords(dims: [usize; 3], coords: Vec<[u32; 3]>) -> Result<Self> {
-        let inside = coords.iter().all(|c| (0..3).all(|a| (c[a] as usize) < dims[a]));
-        require(inside, "coords", format!("block coordinates below {dims:?}"), "one outside")?;
+    pub fn from_coords(coords: Vec<[u32; 3]>) -> Result<Self> {
         let ascending = coords.windows(2).all(|pair| pair[0] < pair[1]);
         require(ascending, "coords", "ascending and distinct block coordinates", "others")?;
-        let mut slot = vec![NONE; dims[0] * dims[1] * dims[2]];
+        let end = |pick: fn(u32, u32) -> u32, a: usize| coords.iter().map(|c| c[a]).reduce(pick);
+        let tile = Tile {
+            low: std::array::from_fn(|a| end(u32::min, a).map_or(0, |v| v as usize)),
+            high: std::array::from_fn(|a| end(u32::max, a).map_or(0, |v| v as usize + 1)),
+        };
+        let count = tile.dims().iter().map(|&n| n as u128).product::<u128>();
+        require(count < 1 << 34, "coords", "a box of fewer than 2^34 blocks", count)?;
+        let mut slot = vec![NONE; tile.count()];
         for (n, c) in coords.iter().enumerate() {
-            slot[(c[0] as usize * dims[1] + c[1] as usize) * dims[2] + c[2] as usize] = n as u32;
+            if let Some(index) = tile.index(c.map(|v| v as usize)) {
+                slot[index] = n as u32;
+            }
         }
-        Ok(Self { dims, slot, coords })
+        Ok(Self { tile, slot, coords })
     }
 
-    /// Slot of the block at (i, j, k), [`NONE`] outside the grid.
+    /// Slot of the block at (i, j, k) of the grid, [`NONE`] outside the tile.
     #[inline(always)]
     pub fn at(&self, i: usize, j: usize, k: usize) -> u32 {
-        if i >= self.dims[0] || j >= self.dims[1] || k >= self.dims[2] {
-            return NONE;
-        }
-        self.slot[(i * self.dims[1] + j) * self.dims[2] + k]
+        self.tile.index([i, j, k]).map_or(NONE, |index| self.slot[index])
     }
 }

@@ -8,40 +8,55 @@
 //! A silhouette's distance changes by a pixel a pixel, so its value at the middle of the rectangle that a block projects to bounds all
 //! of it: voxels ask only the views whose border may matter to them, and get what asking all views would give.
 
-use crate::fuse::{FusionParams, FusionView};
-use crate::grid::{Grid, SIDE};
+use crate::grid::{Grid, SIDE, Tile};
 use crate::raster::Raster;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Unmarks blocks outside the hull and marks all those inside it.
-pub fn restrict_to_hull(grid: &Grid, views: &[FusionView], params: &FusionParams, flags: &[AtomicBool]) {
-    let dims = grid.blocks();
+/// One camera's soft silhouette.
+#[derive(Debug, Clone, Copy)]
+pub struct SoftSilhouette<'a> {
+    /// Signed distance to its border in pixels, positive outside.
+    pub distance: Raster<'a, f32>,
+    /// What the camera saw, in pixels of the raster: x0, y0, x1, y1.
+    pub window: [f64; 4],
+    /// P = K [R | t], row-major 3x4.
+    pub projection: [f64; 12],
+    /// Focal length in pixels, turns distances into world units.
+    pub focal: f64,
+}
+
+/// Unmarks blocks outside the hull and marks all those inside it; `tolerance` is the share of the silhouettes that may disagree.
+pub fn restrict_to_hull(grid: &Grid, tile: &Tile, views: &[SoftSilhouette], tolerance: f32, flags: &[AtomicBool]) {
     let half = 0.5 * SIDE as f64;
     let radius = (half * grid.voxel * 3f64.sqrt()) as f32;
     flags.par_iter().enumerate().for_each_init(
         || Vec::with_capacity(views.len()),
         |outside, (index, flag)| {
-            let (i, rest) = (index / (dims[1] * dims[2]), index % (dims[1] * dims[2]));
-            let corner = [i, rest / dims[2], rest % dims[2]];
+            let corner = tile.block(index);
             let p = std::array::from_fn(|a| grid.origin[a] + grid.voxel * (corner[a] as f64 * SIDE as f64 + half));
             outside.clear();
             outside.extend(views.iter().filter_map(|v| distance(v, p)));
-            let silhouettes = views.iter().filter(|v| v.silhouette.is_some()).count();
-            let vote = Vote { silhouettes, seen: outside.len(), above: 0 };
+            let vote = Vote { silhouettes: views.len(), seen: outside.len(), above: 0 };
             // A block on the border of the hull lies within its radius of it.
-            flag.store(vote.distance(outside, params.hull_tolerance) < radius * 1.2, Ordering::Relaxed);
+            flag.store(vote.distance(outside, tolerance) < radius * 1.2, Ordering::Relaxed);
         },
     );
 }
 
-/// Raises a block's values, in units of τ, to the hull's distance.
-pub fn cut_block(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &FusionParams, out: &mut [f32]) {
-    let mut vote = Vote::default();
+/// Raises a block's values, in units of the truncation, to the hull's distance.
+pub fn cut_block(
+    grid: &Grid,
+    at: [u32; 3],
+    views: &[SoftSilhouette],
+    tolerance: f32,
+    truncation: f64,
+    out: &mut [f32],
+) {
+    let mut vote = Vote { silhouettes: views.len(), ..Vote::default() };
     let mut open = Vec::with_capacity(views.len());
-    for view in views.iter().filter(|v| v.silhouette.is_some()) {
-        vote.silhouettes += 1;
-        match answer(grid, at, view, params.truncation) {
+    for view in views {
+        match answer(grid, at, view, truncation) {
             Answer::Unseen => {}
             Answer::Inside => vote.seen += 1,
             Answer::Outside => {
@@ -52,14 +67,14 @@ pub fn cut_block(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &Fusio
         }
     }
     // More of them may see it, which allows more to disagree.
-    if vote.above > vote.allowed(vote.seen + open.len(), params.hull_tolerance) {
+    if vote.above > vote.allowed(vote.seen + open.len(), tolerance) {
         out.fill(1.0);
         return;
     }
     if open.is_empty() && vote.enough(vote.seen) {
         return;
     }
-    let inverse = (1.0 / params.truncation) as f32;
+    let inverse = (1.0 / truncation) as f32;
     let mut outside = Vec::with_capacity(open.len());
     for (n, v) in out.iter_mut().enumerate() {
         let local = [n / (SIDE * SIDE), n / SIDE % SIDE, n % SIDE];
@@ -68,7 +83,7 @@ pub fn cut_block(grid: &Grid, at: [u32; 3], views: &[FusionView], params: &Fusio
         outside.clear();
         outside.extend(open.iter().filter_map(|view| distance(view, p)));
         let here = Vote { seen: vote.seen + outside.len(), ..vote };
-        *v = v.max((here.distance(&mut outside, params.hull_tolerance) * inverse).clamp(-1.0, 1.0));
+        *v = v.max((here.distance(&mut outside, tolerance) * inverse).clamp(-1.0, 1.0));
     }
 }
 
@@ -122,8 +137,7 @@ enum Answer {
 /// Pixels by which interpolated distances may differ more than their places do: two cells' diagonals and the step at the border.
 const SLACK: f64 = 4.0;
 
-fn answer(grid: &Grid, at: [u32; 3], view: &FusionView, truncation: f64) -> Answer {
-    let Some(silhouette) = &view.silhouette else { return Answer::Unseen };
+fn answer(grid: &Grid, at: [u32; 3], view: &SoftSilhouette, truncation: f64) -> Answer {
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for corner in 0..8usize {
         let q = project(
@@ -149,9 +163,9 @@ fn answer(grid: &Grid, at: [u32; 3], view: &FusionView, truncation: f64) -> Answ
         return Answer::Near;
     }
     let radius = 0.5 * (high[0] - low[0]).hypot(high[1] - low[1]);
-    let middle = pixels(silhouette, 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]));
+    let middle = pixels(&view.distance, 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]));
     // Beyond the raster's ends the way to it adds to the distance there.
-    let (width, height) = (silhouette.width as f64 - 1.0, silhouette.height as f64 - 1.0);
+    let (width, height) = (view.distance.width as f64 - 1.0, view.distance.height as f64 - 1.0);
     let cut = low[0] < 0.0 || low[1] < 0.0 || high[0] > width || high[1] > height;
     let reach = if cut { 2.0 * radius } else { radius } + SLACK;
     let least = truncation * view.focal / low[2];
@@ -165,8 +179,7 @@ fn answer(grid: &Grid, at: [u32; 3], view: &FusionView, truncation: f64) -> Answ
 }
 
 /// A silhouette's distance in world units at a place, positive outside; none where the camera does not see it.
-fn distance(view: &FusionView, p: [f64; 3]) -> Option<f32> {
-    let silhouette = view.silhouette.as_ref()?;
+fn distance(view: &SoftSilhouette, p: [f64; 3]) -> Option<f32> {
     let q = project(view, p);
     if q[2] <= 0.0 {
         return None;
@@ -174,7 +187,7 @@ fn distance(view: &FusionView, p: [f64; 3]) -> Option<f32> {
     let (u, v) = (q[0] / q[2], q[1] / q[2]);
     let [x0, y0, x1, y1] = view.window;
     let seen = !(u < x0 || v < y0 || u > x1 || v > y1);
-    seen.then(|| pixels(silhouette, u, v) * (q[2] / view.focal) as f32)
+    seen.then(|| pixels(&view.distance, u, v) * (q[2] / view.focal) as f32)
 }
 
 /// A silhouette's distance in pixels; beyond the raster it is at least as far as the way to it.
@@ -190,7 +203,7 @@ fn pixels(silhouette: &Raster<f32>, u: f64, v: f64) -> f32 {
 }
 
 #[inline(always)]
-fn project(view: &FusionView, p: [f64; 3]) -> [f64; 3] {
+fn project(view: &SoftSilhouette, p: [f64; 3]) -> [f64; 3] {
     let m = &view.projection;
     std::array::from_fn(|r| m[4 * r] * p[0] + m[4 * r + 1] * p[1] + m[4 * r + 2] * p[2] + m[4 * r + 3])
 }
@@ -227,21 +240,17 @@ mod tests {
             let rasters: Vec<Vec<f32>> = discs.iter().map(|[x, y, r]| {
                 (0..w * h).map(|n| (((n % w) as f64 - x).hypot((n / w) as f64 - y) - r) as f32).collect()
             }).collect();
-            let empty = vec![0.0f32; w * h];
             let raster = |d| Raster::new(d, w, h, "raster").unwrap();
             let border = if cropped { 20.0 } else { 0.0 };
-            let views: Vec<FusionView> = rasters.iter().enumerate().map(|(n, d)| FusionView {
-                depth: raster(&empty), weight: raster(&empty), silhouette: Some(raster(d)),
+            let views: Vec<SoftSilhouette> = rasters.iter().enumerate().map(|(n, d)| SoftSilhouette {
+                distance: raster(d),
                 window: [-border, -border, 47.0 + border, 39.0 + border],
                 projection: camera(n as f64 * 0.7 + seed as f64, w, h), focal: 60.0,
             }).collect();
-            let params = FusionParams {
-                truncation, free_weight: 1.0, min_weight: 0.0, smoothing: 0.0, solid_weight: 0.5, hull_tolerance: tolerance, max_memory: 1 << 30,
-            };
             let grid = Grid::new([-reach; 3], reach / 16.0, [33; 3]).unwrap();
             for at in (0..64u32).map(|n| [n / 16, n / 4 % 4, n % 4]) {
                 let mut found = [-1.0f32; BLOCK];
-                cut_block(&grid, at, &views, &params, &mut found);
+                cut_block(&grid, at, &views, tolerance, truncation, &mut found);
                 for (n, &v) in found.iter().enumerate() {
                     let local = [n / 64, n / 8 % 8, n % 8];
                     let p = std::array::from_fn(|a| grid.origin[a] + grid.voxel * f64::from(at[a] * 8 + local[a] as u32));

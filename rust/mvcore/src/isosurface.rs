@@ -13,7 +13,7 @@
 
 use crate::cube::{EDGES, TRIANGLES};
 use crate::error::Result;
-use crate::grid::{BLOCK, BlockMap, Grid, NONE, SIDE};
+use crate::grid::{BLOCK, BlockMap, Grid, NONE, SIDE, Tile};
 use crate::memory::zeroed;
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -41,8 +41,8 @@ pub fn isosurface_dense(values: &[f32], shape: [usize; 3]) -> Result<Surface> {
         format!("{} samples", shape.iter().product::<usize>()),
         values.len(),
     )?;
-    let dims = grid.blocks();
-    let map = BlockMap::from_flags(dims, std::iter::repeat_n(true, dims.iter().product()));
+    let tile = Tile::whole(&grid);
+    let map = BlockMap::from_flags(tile, std::iter::repeat_n(true, tile.count()));
     Ok(extract(&map, &Dense { values, shape }))
 }
 
@@ -98,8 +98,9 @@ impl Samples for Dense<'_> {
     fn bits(&self, map: &BlockMap) -> Vec<Bits> {
         let [nx, ny, nz] = self.shape;
         let mut bits = zeroed::<Bits>(map.coords.len());
-        bits.par_chunks_exact_mut(map.dims[2]).enumerate().for_each(|(line, out)| {
-            let (i0, j0) = (line / map.dims[1] * SIDE, line % map.dims[1] * SIDE);
+        let [_, y, z] = map.tile.dims();
+        bits.par_chunks_exact_mut(z).enumerate().for_each(|(line, out)| {
+            let (i0, j0) = (line / y * SIDE, line % y * SIDE);
             for i in i0..nx.min(i0 + SIDE) {
                 for j in j0..ny.min(j0 + SIDE) {
                     row_bits(&self.values[(i * ny + j) * nz..][..nz], (i - i0) * SIDE + j - j0, out);
@@ -494,7 +495,7 @@ mod tests {
     fn sparse_equals_dense_and_unknown_cells_have_no_surface() {
         let n = 24;
         let dense = sphere(n, 7.1);
-        let all = BlockMap::from_flags([3; 3], std::iter::repeat_n(true, 27));
+        let all = BlockMap::from_flags(Tile { low: [0; 3], high: [3; 3] }, std::iter::repeat_n(true, 27));
         let blocked = |map: &BlockMap| -> Vec<f32> {
             map.coords
                 .iter()
@@ -507,7 +508,7 @@ mod tests {
         };
         let whole = isosurface_sparse(&all, &blocked(&all)).unwrap();
         assert_eq!(whole, isosurface_dense(&dense, [n; 3]).unwrap());
-        let some = BlockMap::from_flags([3; 3], (0..27).map(|b| b != 13));
+        let some = BlockMap::from_flags(Tile { low: [0; 3], high: [3; 3] }, (0..27).map(|b| b != 13));
         let open = isosurface_sparse(&some, &blocked(&some)).unwrap();
         assert!(open.faces.len() < whole.faces.len());
         assert!(directed_edges(&open).values().all(|&n| n == 1));

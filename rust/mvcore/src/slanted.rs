@@ -74,7 +74,8 @@ const UNSEEN: f32 = 1.0;
 /// Most source views; more than enough, and it keeps the costs on the stack.
 const MAX_SOURCES: usize = 16;
 
-/// Improves the planes of `init` (h·w, row-major) in place of a copy; `prior` holds inverse depths, 0 where there is none.
+/// Improves the planes of `init` (h·w, row-major) in place of a copy; `prior` holds inverse depths, 0 where there is none. A pixel
+/// with neither is left alone.
 pub fn refine(
     reference: Raster<u8>,
     sources: &[(Raster<u8>, Epipolar)],
@@ -144,6 +145,9 @@ impl Scene<'_> {
         let width = self.reference.width;
         planes.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
             for (x, h) in row.iter_mut().enumerate().filter(|(x, _)| chosen((*x, y))) {
+                if h.w == 0.0 && self.prior[y * width + x] == 0.0 {
+                    continue;
+                }
                 let mut view = self.view(x, y);
                 *h = f((x, y), &mut view, *h);
             }

@@ -106,10 +106,11 @@ fn smooth_block(wide: &[[f32; 2]], taps: &[f32; 2 * HALO + 1], values: &[f32], o
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::grid::Tile;
 
     #[test]
     fn smoothing_keeps_a_slope_and_mends_a_speck() {
-        let map = BlockMap::from_flags([2, 2, 2], std::iter::repeat_n(true, 8));
+        let map = BlockMap::from_flags(Tile { low: [0; 3], high: [2; 3] }, std::iter::repeat_n(true, 8));
         let ramp = |slot: usize, n: usize| ((map.coords[slot][0] as usize * SIDE + n / 64) as f32 - 7.5) / 16.0;
         let mut values: Vec<f32> = (0..8 * BLOCK).map(|n| ramp(n / BLOCK, n % BLOCK)).collect();
         let speck = 7 * BLOCK + 3 * 64 + 3 * 8 + 3;
