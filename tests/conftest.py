@@ -63,11 +63,11 @@ def render_sphere(camera: mvcore.Camera, radius=0.5):
 BALLS = [((0.0, 0.0, 0.0), 0.4), ((0.35, 0.1, 0.15), 0.25), ((-0.1, 0.35, -0.2), 0.22)]
 
 
-def render_target(camera: mvcore.Camera, pose=None):
+def render_target(camera: mvcore.Camera, pose=None, wall=6.0):
     """Three textured balls grown together, moved by ``pose`` (4, 4), before the same wall; without a pose the wall alone."""
     grid = camera.pixel_grid().reshape(-1, 2)
     rays = np.column_stack([grid, np.ones(len(grid))]) @ np.linalg.inv(camera.K).T @ camera.R
-    o, s = camera.center, np.full(len(grid), 6.0)
+    o, s = camera.center, np.full(len(grid), wall)
     back = np.eye(4) if pose is None else np.linalg.inv(pose)
     hit = np.zeros(len(grid), bool)
     for center, radius in BALLS if pose is not None else ():

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import mvcore
 import numpy as np
@@ -8,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import _core
 from mvcore.config import Config, DepthConfig, SurfaceConfig, VolumeConfig
-from mvcore.depth import View, estimate_depth, filter_depth
+from mvcore.depth import View, estimate_depth, filter_depth, refine_depth, seeded_depth, sweep_depth
 from mvcore.errors import InvalidInputError, ReconstructionError
 from mvcore.io.images import read_image
 from mvcore.sparse import (
@@ -26,10 +28,10 @@ from mvcore.sparse import (
     target_box,
     view_scores,
 )
-from mvcore.surface import Surface, decimate, drop_small_parts, extract_surface, marching_cubes, smooth
+from mvcore.surface import Surface, decimate, drop_small_parts, extract_surface, isosurface, marching_cubes, smooth
 from mvcore.texture import colour_gains, texture
 from mvcore.types import DepthMap, Report
-from mvcore.volume import Volume, fuse, repaired_masks, silhouette_distance
+from mvcore.volume import Volume, fuse, fuse_tiles, repaired_masks, silhouette_distance
 
 
 def test_unknown_settings_name_the_nearest():
@@ -112,6 +114,46 @@ def test_depth_of_a_sphere_and_its_filter(ring):
     assert np.mean(share) > 0.8
     assert np.mean(kept) > 0.5
     assert np.mean(right) > 0.95
+
+
+def test_an_expected_surface_seeds_the_depth_and_a_wrong_one_does_no_harm(ring):
+    cameras, images, depths, masks = ring
+    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c) for i, c in zip(images, cameras)]
+    sources = [views[j] for j in (10, 11, 1, 2)]
+
+    def share(rough):
+        found = refine_depth(views[0], sources, rough, ())
+        return (np.abs(found.depth - depths[0]) < 0.01 * depths[0])[masks[0]].mean()
+
+    config = DepthConfig()
+    known = np.where(masks[0], depths[0], 0).astype(np.float32)
+    nearly = np.where(masks[0], depths[0] + 0.03 * np.sin(np.arange(depths[0].shape[1]) / 9.0), 0).astype(np.float32)
+    swept = share(sweep_depth(views[0], sources, 1.2, 2.6, config))
+    assert share(seeded_depth(views[0], sources, 1.2, 2.6, known, config)) > swept - 0.02
+    assert share(seeded_depth(views[0], sources, 1.2, 2.6, nearly, config)) > swept - 0.02
+    wrong = np.where(masks[0], 2.4, 0).astype(np.float32)
+    assert share(seeded_depth(views[0], sources, 1.2, 2.6, wrong, config)) > swept - 0.05
+    assert share(seeded_depth(views[0], sources, 1.2, 2.6, np.zeros_like(known), config)) == swept
+    # With few planes the sweep misses the surface; what is expected carries it.
+    few = replace(config, planes=6)
+    assert share(seeded_depth(views[0], sources, 1.2, 2.6, known, few)) > share(sweep_depth(views[0], sources, 1.2, 2.6, few))
+    with pytest.raises(InvalidInputError, match="seed"):
+        seeded_depth(views[0], sources, 1.2, 2.6, known[:-1], config)
+
+
+def test_depth_is_looked_for_where_the_mask_wants_it(ring):
+    cameras, images, depths, masks = ring
+    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c) for i, c in zip(images, cameras)]
+    sources = [views[j] for j in (10, 11, 1, 2)]
+    left = (np.arange(masks[0].shape[1]) < masks[0].shape[1] // 2)[None] & masks[0]
+    asked = replace(views[0], mask=left.astype(np.uint8))
+    everywhere, here = (estimate_depth(v, sources, 1.2, 2.6) for v in (views[0], asked))
+    right = [(np.abs(d.depth - depths[0]) < 0.01 * depths[0])[left].mean() for d in (everywhere, here)]
+    assert right[1] > right[0] - 0.02
+    away = cv2.dilate(left.astype(np.uint8), np.ones((61, 61), np.uint8)) == 0
+    assert away.any()
+    assert (here.depth[away] == 0).all()
+    assert (here.confidence[here.depth == 0] == 0).all()
 
 
 def test_depth_needs_sources_and_a_range(ring):
@@ -200,6 +242,38 @@ def test_voxels_grow_until_the_memory_suffices(ring):
     assert "voxels grew" in report.warnings[0]
     with pytest.raises(ReconstructionError, match="inside the bounds"):
         fuse(maps, cameras, bounds + 100, config=VolumeConfig(voxel=0.03))
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_tiles_join_to_the_surface_of_the_whole(ring, cut):
+    cameras, _, depths, masks = ring
+    maps = [DepthMap(d.astype(np.float32), np.ones(d.shape, np.float32)) for d in depths]
+    given = [(m * 255).astype(np.uint8) for m in masks] if cut else None
+    bounds = np.array([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
+    config, report = VolumeConfig(voxel=0.02), Report()
+    whole = fuse(maps, cameras, bounds, given, config)
+    tiles = list(fuse_tiles(maps, cameras, bounds, given, replace(config, max_memory=whole.values.nbytes // 3), report))
+    assert len(tiles) > 2
+    assert report.values["volume"]["tiles"] == len(tiles)
+    assert report.values["volume"]["voxel"] == whole.voxel
+    assert not report.warnings
+    # Shared samples are the same bits: every known sample of a tile is the whole's.
+    slot = {tuple(c): n for n, c in enumerate(whole.coords.tolist())}
+    for tile in tiles:
+        same = whole.values[[slot[tuple(c)] for c in tile.coords.tolist()]]
+        known = np.isfinite(tile.values)
+        assert (tile.values[known] == same[known]).all()
+    one, joined = isosurface(whole), isosurface(tiles)
+
+    def triangles(surface):
+        """Each triangle from its least corner on, in order."""
+        corners = [[tuple(c) for c in t] for t in surface.vertices[surface.faces].tolist()]
+        return sorted(min((a, b, c), (b, c, a), (c, a, b)) for a, b, c in corners)
+
+    assert len(joined.vertices) == len(one.vertices)
+    assert triangles(joined) == triangles(one)
+    with pytest.raises(ReconstructionError, match="max_memory"):
+        list(fuse_tiles(maps, cameras, bounds, given, replace(config, max_memory=1000)))
 
 
 @settings(max_examples=30)

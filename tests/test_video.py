@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from conftest import render_target, rig, turned, write_clips
 from hypothesis import given
 from hypothesis import strategies as st
 from mvcore import InvalidInputError, ReconstructionError
+from mvcore.carve import Occupancy
 from mvcore.cli import app
 from mvcore.config import TargetConfig
 from mvcore.io import load_video
@@ -26,6 +28,7 @@ from mvcore.motion import Cloud, find_poses
 from mvcore.sequence import animated, read_index
 from mvcore.store import Store, digest
 from mvcore.target import Background, foreground, learn_backgrounds
+from mvcore.targets import Tracker, find_targets, motions, moved
 from mvcore.video import reconstruct_video
 from mvcore.viewer import write_page
 from typer.testing import CliRunner
@@ -267,18 +270,66 @@ def test_masks_bounds_and_calibration_may_be_given(folder):
         list(reconstruct_video(clips, target="rigid", config=SETTINGS))
 
 
-def test_two_targets_are_two_meshes(tmp_path):
+def test_two_targets_are_two_meshes_that_keep_their_numbers(tmp_path):
     cameras = rig(12, (200, 150))
-    apart = [turned(0, (-0.55, 0, 0)), turned(0, (0.55, 0, 0))]
-    for n, c in enumerate(cameras):
-        own = tmp_path / "images" / f"cam{n:02d}"
-        own.mkdir(parents=True)
-        image = render_small(c, apart)
-        cv2.imwrite(str(own / "frame0.png"), image[..., ::-1])
-        cv2.imwrite(str(own / "background.png"), render_target(c)[0][..., ::-1])
+    # One goes round the other: left and right change places, and which hull is the larger one changes with the views.
+    places = [(-0.5, 0.15 * t) for t in range(-1, 2)]
+    for t, (x, y) in enumerate(places):
+        apart = [turned(10 * t, (x, y, 0)), turned(0, (-x, -y, 0))]
+        for n, c in enumerate(cameras):
+            own = tmp_path / "images" / f"cam{n:02d}"
+            own.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(own / f"frame{t}.png"), render_small(c, apart)[..., ::-1])
+            if not t:
+                cv2.imwrite(str(own / "background.png"), render_target(c)[0][..., ::-1])
     run = reconstruct_video(load_video(tmp_path, cameras), config=SETTINGS)
     run.save(tmp_path / "out")
-    assert sorted(p.name for p in (tmp_path / "out").glob("*.glb")) == ["instant0000_target0.glb", "instant0000_target1.glb"]
+    files = sorted(p.name for p in (tmp_path / "out").glob("*.glb"))
+    assert files == [f"instant{t:04d}_target{k}.glb" for t in range(3) for k in range(2)]
+    ways: dict[int, list[float]] = {}
+    for instant in read_index(tmp_path / "out")["instants"]:
+        for target in instant["report"]["targets"]:
+            ways.setdefault(target["id"], []).append(target["middle"])
+    assert sorted(ways) == [0, 1]
+    for way in np.array([ways[0], ways[1]]):
+        side = np.sign(way[0, 0])
+        assert (np.sign(way[:, 0]) == side).all()  # each stays on its side
+        assert (np.diff(-side * way[:, 1]) > 0.1).all()  # and goes its way
+
+
+def test_targets_are_told_apart_by_their_ways():
+    def target(x, y, volume=1.0):
+        return {"middle": [x, y, 0.0], "box": [[x - 0.5, y - 0.5, -0.5], [x + 0.5, y + 0.5, 0.5]], "volume": volume}
+
+    tracker = Tracker()
+    # Two cross at a right angle, listed by size, which changes; a third comes later, and the first is hidden for an instant.
+    seen = [
+        [target(-1.2, 0), target(0, -1.0)],
+        [target(0, -0.5, 1.1), target(-0.6, 0)],
+        [target(0.0, 0.0), target(0.05, 0.02)],
+        [target(0.6, 0), target(0, 0.5)],
+        [target(0, 1.0), target(3, 3)],
+        [target(3, 3), target(1.8, 0), target(0, 1.5)],
+    ]
+    named = [tracker.follow(t, found) for t, found in enumerate(seen)]
+    assert [t["id"] for t in named[0]] == [0, 1]
+    assert [t["id"] for t in named[1]] == [1, 0]
+    assert [t["id"] for t in named[3]] == [0, 1]
+    assert [t["id"] for t in named[4]] == [1, 2]
+    assert [t["id"] for t in named[5]] == [2, 0, 1]
+
+
+@given(st.floats(-8, 8), st.tuples(*[st.floats(-0.3, 0.3)] * 3))
+def test_the_motion_of_a_hull_is_found(angle, shift):
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 3, indexing="ij"), -1)
+    full = (np.abs(x) < [0.8, 0.4, 0.3]).all(-1) | (np.abs(x - [0.4, 0, 0.5]) < [0.2, 0.3, 0.3]).all(-1)
+    targets, hulls = find_targets(Occupancy(np.full(3, -1.0), 0.05, full), 0.1)
+    assert len(targets) == 1
+    pose = turned(angle, shift)
+    points = hulls.vertices @ pose[:3, :3].T + pose[:3, 3]
+    after = [{**targets[0], "middle": points.mean(0).tolist()}]
+    found = motions(targets, after, hulls, replace(hulls, vertices=points))
+    assert np.abs(moved(hulls.vertices, found, hulls) - points).max() < 0.02
 
 
 def render_small(camera, poses):
@@ -289,7 +340,7 @@ def render_small(camera, poses):
         small = pose.copy()
         small[:3, 3] = 2.2 * pose[:3, 3]
         far = mvcore.Camera(camera.K, camera.R, -camera.R @ (2.2 * camera.center), camera.width, camera.height)
-        picture, mask = render_target(far, small)
+        picture, mask = render_target(far, small, 12.0)
         image[mask] = picture[mask]
     return image
 

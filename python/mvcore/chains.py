@@ -167,10 +167,12 @@ def _match(
 ) -> None:
     """Both passes of all views whose second is missing; the first ones' results are large, and of no use afterwards."""
     missing = [n for n, key in seconds.items() if key not in job.store]
-    for passes in ([first(n) for n in firsts] if missing else [], [second(n) for n in missing]):
-        for wait in passes:
+    if not missing:
+        return
+    for start, views in ((first, list(firsts)), (second, missing)):
+        for wait in [start(n) for n in views]:
             wait()
-    for key in firsts.values() if missing else ():
+    for key in firsts.values():
         job.store.path(key).unlink(missing_ok=True)
 
 
