@@ -102,10 +102,17 @@ def _large(mask: Mask, share: float) -> Mask:
     return (area >= max(16, share * area.max()))[part].astype(np.uint8)
 
 
-def _cut(image: Image, rough: Mask, background: Bool, unknown: Bool, rounds: int) -> Mask:
-    """GrabCut around a rough mask (0 and 1): its border settles on the image's edges; where nothing is known colours decide."""
+Models = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""GrabCut's colour mixtures, (1, 65) float64 each: of the background and of the target."""
+
+
+def _cut(image: Image, rough: Mask, background: Bool, unknown: Bool, rounds: int) -> tuple[Mask, Models | None]:
+    """GrabCut around a rough mask (0 and 1): its border settles on the image's edges; where nothing is known colours decide.
+
+    Also the colours that it found, None where it had nothing to go by.
+    """
     if not rough.any():
-        return rough
+        return rough, None
     y, x = np.nonzero(rough)
     pad = 24
     window = np.s_[max(0, y.min() - pad) : y.max() + pad, max(0, x.min() - pad) : x.max() + pad]
@@ -119,13 +126,44 @@ def _cut(image: Image, rough: Mask, background: Bool, unknown: Bool, rounds: int
     labels = np.ascontiguousarray(labels[window])
     # Colour models need both kinds.
     if not ((labels & 1) == 0).any() or not ((labels & 1) == 1).any():
-        return rough
+        return rough, None
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.setRNGSeed(0)  # its k-means: the same mask each time
     cv2.grabCut(np.ascontiguousarray(image[window]), labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
     out = np.zeros_like(rough)
     out[window] = labels & 1
-    return out
+    return out, models
+
+
+def _likelihood(pixels: NDArray[np.float64], model: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Logarithm of a mixture's density at colours (n, 3)."""
+    weights, means, spreads = model[0, :5], model[0, 5:20].reshape(5, 3), model[0, 20:].reshape(5, 3, 3)
+    total = np.zeros(len(pixels))
+    for weight, mean, spread in zip(weights, means, spreads, strict=True):
+        if weight <= 0:
+            continue
+        spread = spread + NOISE_FLOOR * np.eye(3)
+        away = pixels - mean
+        distance = np.einsum("ni,ij,nj->n", away, np.linalg.inv(spread), away)
+        total += weight * np.exp(-0.5 * distance) / np.sqrt(np.linalg.det(spread))
+    return np.log(total + 1e-30)
+
+
+NOISE_FLOOR = 4.0
+"""Squared grey levels: mixtures of few pixels are narrower than a camera's noise."""
+
+
+def _agreed(image: Image, cut: Mask, seen: Mask, open_: Bool, models: Models | None) -> Mask:
+    """The mask with what all other cameras have for target, where this one cannot know and the colour is rather the target's."""
+    doubtful = (seen > 0) & open_ & (cut == 0)
+    if models is None or not doubtful.any():
+        return cut
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    pixels = smooth[doubtful].astype(np.float64)
+    likely = np.zeros_like(cut)
+    likely[doubtful] = _likelihood(pixels, models[1]) - _likelihood(pixels, models[0]) > 0
+    likely = cv2.morphologyEx(cut | likely, cv2.MORPH_OPEN, _disc(7))
+    return cut | likely
 
 
 def _at(background: Background, size: tuple[int, int]) -> Background:
@@ -173,9 +211,13 @@ def foreground(
         seen = supported([cv2.dilate(r, _disc(7)) for r in rough], reduced, bounds, carving, carving.tolerance)
         rough = [_large(r & (s > 0), config.least_part) for r, s in zip(rough, seen, strict=True)]
         outside = [o | (s == 0) for o, s in zip(outside, seen, strict=True)]
-    cuts = [
-        _large(_cut(p, r, o, u, config.cut_rounds), config.least_part) for p, r, o, u in zip(small, rough, outside, unknown, strict=True)
-    ]
+    found_cuts = [_cut(p, r, o, u, config.cut_rounds) for p, r, o, u in zip(small, rough, outside, unknown, strict=True)]
+    cuts = [_large(c, config.least_part) for c, _ in found_cuts]
+    if bounds is not None and len(images) > 2 and any(u.any() for u in unknown):
+        seen = supported([cv2.dilate(c, _disc(3)) for c in cuts], reduced, bounds, carving, 0.0, len(images) - 1)
+        sure = [s if (s == 0).any() else np.zeros_like(s) for s in seen]  # the others have nothing in common
+        told = zip(small, cuts, sure, found, unknown, found_cuts, strict=True)
+        cuts = [_large(_agreed(p, c, s, u & ~e.background, m), config.least_part) for p, c, s, e, u, (_, m) in told]
     masks = []
     for cut, image in zip(cuts, images, strict=True):
         h, w = image.shape[:2]

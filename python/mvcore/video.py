@@ -33,7 +33,8 @@ class VideoReconstruction:
     model : after the last instant of a rigid target, one `Reconstruction` of all instants in the first one's frame.
     trajectory : (T, 4, 4) float64, which bring the model into the world at each instant, NaN where the target is not seen.
     times : (T,) seconds; names : of the cameras.
-    seconds : wall seconds of each instant, the first one's with what is learnt once a clip; warnings : what the clips, the calibration and the run had to say.
+    seconds : wall seconds of each instant, the first with what is learnt once a clip.
+    warnings : what the clips, the calibration and the run had to say.
     """
 
     times: NDArray[np.float64]
