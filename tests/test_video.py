@@ -16,19 +16,20 @@ import cv2
 import mvcore
 import numpy as np
 import pytest
-from conftest import render_target, rig, turned, write_clips
+from conftest import look_at, render_target, rig, turned, write_clips
 from hypothesis import given
 from hypothesis import strategies as st
 from mvcore import InvalidInputError, ReconstructionError
-from mvcore.carve import Occupancy
+from mvcore.carve import Occupancy, carve_silhouettes, shadow, visual_hull
 from mvcore.cli import app
-from mvcore.config import TargetConfig
+from mvcore.config import TargetConfig, VolumeConfig
 from mvcore.io import load_video
 from mvcore.motion import Cloud, find_poses
 from mvcore.sequence import animated, read_index
 from mvcore.store import Store, digest
+from mvcore.surface import isosurface
 from mvcore.target import Background, foreground, learn_backgrounds
-from mvcore.targets import Tracker, find_targets, motions, moved
+from mvcore.targets import Tracker, find_targets, motions, moved, on_targets
 from mvcore.video import reconstruct_video
 from mvcore.viewer import write_page
 from typer.testing import CliRunner
@@ -319,11 +320,32 @@ def test_targets_are_told_apart_by_their_ways():
     assert [t["id"] for t in named[5]] == [2, 0, 1]
 
 
+def test_phantoms_of_few_silhouettes_are_no_targets():
+    # Two boxes and two cameras at a right angle: two more boxes throw the same shadows.
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 3, indexing="ij"), -1)
+
+    def box(center, side):
+        return (np.abs(x - center) < side).all(-1)
+
+    real = box([-0.5, -0.5, 0], 0.22) | box([0.5, 0.5, 0], 0.21)
+    cameras = [look_at((40, 0, 0), (0, 0, 0), (200, 150), 3000.0), look_at((0, 40, 0), (0, 0, 0), (200, 150), 3000.0)]
+    masks = [shadow(Occupancy(np.full(3, -1.0), 0.05, real), c, 0.1) for c in cameras]
+    hull = carve_silhouettes(masks, cameras, np.array([[-1.0] * 3, [1.0] * 3]), voxel=0.05, tolerance=0.0)
+    targets, hulls = find_targets(hull, masks, cameras, 0.1)
+    assert len(targets) == 2
+    assert {tuple(np.sign(np.round(t["middle"], 1))) for t in targets} in ({(1, 1, 0), (-1, -1, 0)}, {(1, -1, 0), (-1, 1, 0)})
+    surface = isosurface(visual_hull(masks, cameras, np.array([[-1.0] * 3, [1.0] * 3]), VolumeConfig(voxel=0.05)))
+    kept = on_targets(surface, hulls)
+    assert 0.4 * len(surface.faces) < len(kept.faces) < 0.6 * len(surface.faces)
+
+
 @given(st.floats(-8, 8), st.tuples(*[st.floats(-0.3, 0.3)] * 3))
 def test_the_motion_of_a_hull_is_found(angle, shift):
     x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 3, indexing="ij"), -1)
     full = (np.abs(x) < [0.8, 0.4, 0.3]).all(-1) | (np.abs(x - [0.4, 0, 0.5]) < [0.2, 0.3, 0.3]).all(-1)
-    targets, hulls = find_targets(Occupancy(np.full(3, -1.0), 0.05, full), 0.1)
+    hull = Occupancy(np.full(3, -1.0), 0.05, full)
+    camera = rig(1)[0]
+    targets, hulls = find_targets(hull, [shadow(hull, camera)], [camera], 0.1)
     assert len(targets) == 1
     pose = turned(angle, shift)
     points = hulls.vertices @ pose[:3, :3].T + pose[:3, 3]

@@ -97,8 +97,12 @@ def carve_silhouettes(
 
 def shadow(hull: Occupancy, camera: Camera, grow: float = 1.0) -> Mask:
     """Pixels whose ray meets a full voxel, (h, w) uint8 of 0 and 255; voxels count ``grow`` times their size."""
+    return splat(hull.shell(), grow * hull.voxel, camera)
+
+
+def splat(points: NDArray[np.float64], size: float, camera: Camera) -> Mask:
+    """Pixels that points (n, 3) cover, each a cube of ``size`` in world units, (h, w) uint8 of 0 and 255."""
     image = np.zeros((camera.height, camera.width), np.uint8)
-    points = hull.shell()
     if not len(points):
         return image
     z = camera.to_camera(points)[:, 2]
@@ -109,7 +113,7 @@ def shadow(hull: Occupancy, camera: Camera, grow: float = 1.0) -> Mask:
     if not inside.any():
         return image
     # A cube's diagonal reaches 0.87 of its side to either side.
-    reach = int(np.ceil(0.87 * grow * hull.voxel * camera.K[0, 0] / float(np.quantile(z[inside], 0.1))))
+    reach = int(np.ceil(0.87 * size * camera.K[0, 0] / float(np.quantile(z[inside], 0.1))))
     return cv2.dilate(image, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)))
 
 

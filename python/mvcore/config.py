@@ -203,7 +203,7 @@ class VideoConfig:
     stereo_angle: float = 40.0
     """Degrees between a view and its nearest neighbour, in the median, beyond which stereo cannot work and the hull is the result."""
     least_target: float = 0.1
-    """Parts of the hull with a smaller share of the largest part's volume are no targets."""
+    """Parts of the hull with a smaller share of the largest part's volume are no targets, unless they are close to one."""
     model_instants: int = 16
     """Most instants, spread over the clip, whose views make a rigid target's model."""
     registration_points: int = 30_000

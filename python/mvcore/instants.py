@@ -30,7 +30,7 @@ from .result import Reconstruction
 from .store import Entry, Store, digest, file_digest
 from .surface import isosurface
 from .target import Background, foreground, learn_backgrounds
-from .targets import Hulls, find_targets, motions, moved
+from .targets import Hulls, find_targets, motions, moved, on_targets
 from .texture import Given
 from .types import Bounds, DepthMap, Image, Report, SparsePoints
 from .volume import Volume
@@ -186,7 +186,7 @@ def prepare(job: Job, learn_key: str, instant: int) -> tuple[dict[str, NDArray[A
     box = around
     if masks is not None:
         hull = target_hull(masks, cameras, around, config.carve)
-        targets, hulls = find_targets(hull, config.video.least_target)
+        targets, hulls = find_targets(hull, masks, cameras, config.video.least_target)
         if not targets:
             return {"box": box}, {
                 "empty": True,
@@ -407,6 +407,8 @@ def mesh(
         before = stored(job, expect_key).arrays
         given = replace(given, centers=before["centers"], views=before["face_views"])
     found = isosurface(_volume(job, key) for key in field.meta["volumes"])
+    if entry.meta["targets"] and len(found.faces):
+        found = on_targets(found, Hulls.from_arrays(entry.arrays))
     result = finish(views, plan, filtered_of(field.arrays, len(views.images)), found, job.config, report, given=given)
     return result_arrays(result), {"report": result.report}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -275,15 +275,53 @@ def learn_backgrounds(
         h, w = plate.shape[:2]
         hidden, around = (cv2.resize(np.asarray(m, np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0 for m in (ghost, region))
         found.append(Background(plate, ~hidden, around | hidden))
+    if bounds is None or len(cameras) < 3 or all(f.known.all() for f in found):
+        return found
+    return _uncovered(frames, cameras, found, bounds, config, carving)
+
+
+def _uncovered(
+    frames: Sequence[Sequence[Image]],
+    cameras: Sequence[Camera],
+    backgrounds: Sequence[Background],
+    bounds: Bounds,
+    config: TargetConfig,
+    carving: CarveConfig,
+) -> list[Background]:
+    """Backgrounds with what is seen behind the target at the samples at which, as the other cameras have it, it is elsewhere."""
+    quick = replace(config, max_size=config.learn_size)
+    free: list[list[Bool]] = [[] for _ in cameras]
+    for sample in zip(*frames, strict=True):
+        pairs = [reduce(f, c, config.learn_size) for f, c in zip(sample, cameras, strict=True)]
+        small, reduced = [p[0] for p in pairs], [p[1] for p in pairs]
+        masks = foreground(small, reduced, backgrounds, bounds, quick, carving)
+        seen = supported([cv2.dilate(m, _disc(5)) for m in masks], reduced, bounds, carving, 0.0, len(cameras) - 1)
+        for n, (m, s) in enumerate(zip(masks, seen, strict=True)):
+            free[n].append(cv2.dilate(m | s, _disc(5)) == 0)
+    found = []
+    for own, camera, background, places in zip(frames, cameras, backgrounds, free, strict=True):
+        samples = np.stack([reduce(f, camera, config.max_size)[0] for f in own])
+        h, w = background.known.shape
+        open_ = np.stack([cv2.resize(p.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0 for p in places])
+        learnt = ~background.known & (open_.sum(0) >= LEAST_SAMPLES)
+        plate = np.where(learnt[..., None], _commonest(samples, config, open_), background.plate)
+        found.append(Background(np.ascontiguousarray(plate, np.uint8), background.known | learnt, background.region))
     return found
 
 
-def _commonest(samples: NDArray[np.uint8], config: TargetConfig) -> Image:
-    """The colour of each pixel that the most samples are near to: their mean."""
+LEAST_SAMPLES = 3
+"""Samples that must show a place without the target before its background counts as known."""
+
+
+def _commonest(samples: NDArray[np.uint8], config: TargetConfig, valid: Bool | None = None) -> Image:
+    """The colour of each pixel that the most samples are near to: their mean. Samples that are not ``valid`` there do not count."""
     plate = np.empty(samples.shape[1:], np.uint8)
     for y in range(len(plate)):  # a row at a time: all pairs of samples would be large
         row = samples[:, y].astype(np.int16)
         near = np.abs(row[:, None] - row[None]).max(-1) < config.threshold
+        if valid is not None:
+            near &= valid[:, None, y] & valid[None, :, y]
+            near |= np.eye(len(row), dtype=bool)[..., None]  # of itself a sample is always near
         best = near.sum(1).argmax(0)
         mine = np.take_along_axis(near, best[None, None], 0)[0]
         plate[y] = np.rint((row * mine[..., None]).sum(0) / mine.sum(0)[:, None])

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _core
-from .carve import Occupancy
+from .cameras import Camera
+from .carve import Mask, Occupancy, splat
 from .motion import align, cloud_of_mesh
 from .result import Reconstruction
-from .surface import marching_cubes
+from .surface import Surface, marching_cubes
 
 Float = NDArray[np.float64]
 Target = Mapping[str, Any]
@@ -24,6 +25,12 @@ HULL_ROUNDS = 15
 """Rounds of that alignment: hulls are rough, more would not tell more."""
 LEAST_SHARE = 0.3
 """Share of a hull's points with a partner below which only the way of its middle is taken as its motion."""
+LEAST_PART = 0.003
+"""Share of the largest part's volume below which a part of the hull is noise."""
+JOINED = 0.08
+"""Share of a target's length within which another part of the hull belongs to it."""
+SEEN_ALONE = 0.1
+"""Share of a part's shadow that some camera must see beside those of larger parts."""
 MEMORY = 5
 """Instants for which a target that is not seen is remembered."""
 
@@ -32,42 +39,84 @@ MEMORY = 5
 class Hulls:
     """The surfaces of all targets' hulls.
 
-    vertices : (V, 3) float64, world. faces : (F, 3) uint32. owner : (F,) int32, the target of each face.
+    vertices : (V, 3) float64, world. faces : (F, 3) uint32. owner : (F,) int32, the target of each face. voxel : of the hulls.
     """
 
     vertices: Float
     faces: NDArray[np.uint32]
     owner: NDArray[np.int32]
+    voxel: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it by name, to be stored."""
-        return {"hull_vertices": self.vertices, "hull_faces": self.faces, "hull_owner": self.owner}
+        named = {"hull_vertices": self.vertices, "hull_faces": self.faces, "hull_owner": self.owner}
+        return named | {"hull_voxel": np.array(self.voxel)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Hulls:
         """What `arrays` gave."""
-        return cls(arrays["hull_vertices"], arrays["hull_faces"], arrays["hull_owner"])
+        return cls(arrays["hull_vertices"], arrays["hull_faces"], arrays["hull_owner"], float(arrays["hull_voxel"]))
 
 
-def find_targets(hull: Occupancy, least: float) -> tuple[list[dict[str, Any]], Hulls]:
-    """Connected parts of the hull, largest first; those with a smaller share than ``least`` of its volume are none."""
+def find_targets(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camera], least: float) -> tuple[list[dict[str, Any]], Hulls]:
+    """The targets that a hull shows, the one with the largest part first.
+
+    Each is a connected part with at least the share ``least`` of the largest part's volume, and the parts close to it: a mask with a gap
+    cuts a leg off. Few silhouettes also leave phantoms, parts that show nothing of any mask but what larger ones show already; they are
+    none.
+    """
     padded = np.pad(np.where(hull.occupied, -1.0, 1.0).astype(np.float32), 1, constant_values=1.0)
     points, faces = marching_cubes(padded)
     vertices = hull.origin + hull.voxel * (points.astype(np.float64) - 1)
     owner = np.full(len(faces), -1, np.int32)
-    found: list[dict[str, Any]] = []
-    if len(faces):
-        part = _core.components(faces)
-        a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
-        volumes = np.bincount(part, (a * np.cross(b, c)).sum(1) / 6)
-        for number in np.argsort(-volumes, kind="stable"):
-            if volumes[number] < max(least * volumes.max(), 1.0):
-                break
-            own = vertices[np.unique(faces[part == number])]
-            owner[part == number] = len(found)
-            box = [(own.min(0) - hull.voxel).tolist(), (own.max(0) + hull.voxel).tolist()]
-            found.append({"middle": own.mean(0).tolist(), "box": box, "volume": float(volumes[number] * hull.voxel**3)})
-    return found, Hulls(vertices, faces[owner >= 0], owner[owner >= 0])
+    bodies: list[Float] = []
+    volumes: list[float] = []
+    part = _core.components(faces) if len(faces) else np.zeros(0, np.uint32)
+    a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
+    every = np.bincount(part, (a * np.cross(b, c)).sum(1) / 6)
+    shown = [np.zeros(m.shape, bool) for m in masks]
+    for number in np.argsort(-every, kind="stable"):
+        if every[number] < max(LEAST_PART * every.max(), 1.0):
+            break
+        own = np.ascontiguousarray(vertices[np.unique(faces[part == number])])
+        shadows = [(splat(own, hull.voxel, c) > 0) & (m > 0) for c, m in zip(cameras, masks, strict=True)]
+        alone = max(np.count_nonzero(s & ~o) / max(1, np.count_nonzero(s)) for s, o in zip(shadows, shown, strict=True))
+        if alone < SEEN_ALONE:
+            continue
+        close = [n for n, body in enumerate(bodies) if (_core.nearest(own, body, JOINED * _length(body))[1] >= 0).any()]
+        if close:
+            number_of = close[0]
+            bodies[number_of] = np.concatenate([bodies[number_of], own])
+            volumes[number_of] += float(every[number])
+        elif every[number] >= least * every.max():
+            number_of = len(bodies)
+            bodies.append(own)
+            volumes.append(float(every[number]))
+        else:
+            continue
+        shown = [s | o for s, o in zip(shadows, shown, strict=True)]
+        owner[part == number] = number_of
+    found = []
+    for body, volume in zip(bodies, volumes, strict=True):
+        box = [(body.min(0) - hull.voxel).tolist(), (body.max(0) + hull.voxel).tolist()]
+        found.append({"middle": body.mean(0).tolist(), "box": box, "volume": volume * hull.voxel**3})
+    return found, Hulls(vertices, faces[owner >= 0], owner[owner >= 0], hull.voxel)
+
+
+def _length(points: Float) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def on_targets(surface: Surface, hulls: Hulls) -> Surface:
+    """The connected parts of a surface that are a target's, without phantoms."""
+    part = _core.components(surface.faces)
+    middles = np.ascontiguousarray(surface.vertices[surface.faces].mean(1))
+    hull = np.ascontiguousarray(hulls.vertices[hulls.faces].mean(1))
+    near = _core.nearest(middles, hull, 3 * hulls.voxel)[1] >= 0
+    share = np.bincount(part, near) / np.bincount(part)
+    kept = surface.faces[(share > 0.5)[part]]
+    used, index = np.unique(kept, return_inverse=True)
+    return Surface(surface.vertices[used], index.reshape(-1, 3).astype(np.uint32))
 
 
 def _size(target: Target) -> float:
