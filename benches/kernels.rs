@@ -4,7 +4,7 @@
 //! noisy, never constant.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use mvcore::aggregate::{Penalties, aggregate};
 use mvcore::atlas::{Source, build_atlas};
 use mvcore::carve::{CarveParams, Silhouette, carve};
@@ -16,6 +16,7 @@ use mvcore::match_epipolar::{DESCRIPTOR, Features, match_epipolar};
 use mvcore::mesh::Mesh;
 use mvcore::nearest::nearest;
 use mvcore::nurbs::{self, Knots, Net};
+use mvcore::photo_carve::{Photo as Coloured, PhotoParams, photo_carve};
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::rasterize::rasterize;
 use mvcore::select_views::{Photo, SelectParams, rate, select_views};
@@ -154,6 +155,38 @@ fn volumes(c: &mut Criterion) {
     let vote = CarveParams { tolerance: 0.05, least_views: 2 };
     group.bench_function("carve 24 silhouettes 640x480 into 256^3", |b| {
         b.iter(|| carve(grid, &silhouettes, &vote).unwrap())
+    });
+    let none = vec![0.0f32; w * h];
+    // The sphere's silhouette is a circle of focal / sqrt(8) pixels.
+    let border = focal / 8f64.sqrt();
+    let away = |n: usize| (((n % w) as f64 - 319.5).hypot((n / w) as f64 - 239.5) - border) as f32;
+    let soft: Vec<f32> = (0..w * h).map(away).collect();
+    let hulls: Vec<_> =
+        views.iter().map(|v| FusionView { depth: raster(&none), silhouette: Some(raster(&soft)), ..*v }).collect();
+    group.bench_function("hull field of 24 soft silhouettes in 256^3", |b| {
+        b.iter(|| fuse(grid, &hulls, &FUSION).unwrap());
+    });
+    // The same stripes in every view: they contradict each other all over the ball.
+    let coarse = Grid::new([-1.1; 3], 2.2 / 127.0, [128; 3]).unwrap();
+    let paint = |n: usize| {
+        let stripe = (depth[n] > 0.0) as usize * (1 + (n / w / 24 + n % w / 32) % 3);
+        [20u8, 90, 160, 230][stripe]
+    };
+    let colours: Vec<u8> = (0..w * h * 3).map(|n| paint(n / 3)).collect();
+    let photos: Vec<_> = (0..24)
+        .map(|k| {
+            let (projection, center) = ring(24, k, w, h, focal);
+            Coloured { low: &colours, high: &colours, width: w, height: h, projection, center }
+        })
+        .collect();
+    let full = carve(coarse, &silhouettes, &vote).unwrap();
+    let judge = PhotoParams { threshold: 40, least_views: 3, rounds: 2 };
+    group.bench_function("photo carve 128^3, 24 views, two rounds of six sweeps", |b| {
+        b.iter_batched_ref(
+            || full.clone(),
+            |voxels| photo_carve(coarse, voxels, &photos, &judge).unwrap(),
+            BatchSize::LargeInput,
+        );
     });
     group.bench_function("fuse 24 maps 640x480 into 256^3", |b| b.iter(|| fuse(grid, &views, &FUSION).unwrap()));
     let smooth = FusionParams { smoothing: 0.7, ..FUSION };
