@@ -304,8 +304,8 @@ def _filled(depth: Map) -> Map:
     return known[label]
 
 
-NETWORK_SIDE = 768
-"""Pixels of the longer side at which the network runs: what it finds there the second pass carries to full size."""
+NETWORK_SIDE = 576
+"""Pixels of the longer side at which the network runs: about what it was trained on; the second pass carries that to full size."""
 
 
 def network_depth(
