@@ -27,7 +27,7 @@ LEAST_SHARE = 0.3
 """Share of a hull's points with a partner below which only the way of its middle is taken as its motion."""
 LEAST_PART = 0.003
 """Share of the largest part's volume below which a part of the hull is noise."""
-JOINED = 0.08
+JOINED = 0.12
 """Share of a target's length within which another part of the hull belongs to it."""
 SEEN_ALONE = 0.1
 """Share of a part's shadow that some camera must see beside those of larger parts."""

@@ -393,6 +393,18 @@ mod tests {
         max_memory: 1 << 30,
     };
 
+    fn view<'a>(depth: &'a [f32], weight: &'a [f32], silhouette: Option<&'a [f32]>) -> FusionView<'a> {
+        let raster = |d| Raster::new(d, 64, 64, "raster").unwrap();
+        FusionView {
+            depth: raster(depth),
+            weight: raster(weight),
+            silhouette: silhouette.map(raster),
+            window: [0.0, 0.0, 63.0, 63.0],
+            projection: projection(),
+            focal: 60.0,
+        }
+    }
+
     fn grid() -> Grid {
         Grid::new([-1.0, -1.0, -1.0], 0.05, [41, 41, 41]).unwrap()
     }
@@ -400,15 +412,7 @@ mod tests {
     #[test]
     fn a_plane_becomes_its_distance() {
         let (depth, weight) = (vec![4.0f32; 64 * 64], vec![1.0f32; 64 * 64]);
-        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
-        let view = FusionView {
-            depth: raster(&depth),
-            weight: raster(&weight),
-            silhouette: None,
-            window: [0.0, 0.0, 63.0, 63.0],
-            projection: projection(),
-            focal: 60.0,
-        };
+        let view = view(&depth, &weight, None);
         let volume = fuse(grid(), &[view], &PARAMS).unwrap();
         assert!(!volume.map.coords.is_empty());
         for (c, block) in volume.map.coords.iter().zip(volume.values.chunks_exact(BLOCK)) {
@@ -429,15 +433,7 @@ mod tests {
         let (depth, weight) = (vec![0.0f32; 64 * 64], vec![0.0f32; 64 * 64]);
         let outside: Vec<f32> =
             (0..64 * 64).map(|i| (((i % 64) as f32 - 31.5).hypot((i / 64) as f32 - 31.5)) - 6.0).collect();
-        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
-        let view = FusionView {
-            depth: raster(&depth),
-            weight: raster(&weight),
-            silhouette: Some(raster(&outside)),
-            window: [0.0, 0.0, 63.0, 63.0],
-            projection: projection(),
-            focal: 60.0,
-        };
+        let view = view(&depth, &weight, Some(&outside));
         let volume = fuse(grid(), &[view], &PARAMS).unwrap();
         let value = |i: usize, j: usize, k: usize| {
             let slot = volume.map.at(i / 8, j / 8, k / 8) as usize;
@@ -451,15 +447,7 @@ mod tests {
     fn a_tile_holds_what_the_whole_holds() {
         let depth: Vec<f32> = (0..64 * 64).map(|i| 4.0 + 0.3 * ((i % 64) as f32 * 0.4).sin()).collect();
         let weight = vec![1.0f32; 64 * 64];
-        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
-        let view = FusionView {
-            depth: raster(&depth),
-            weight: raster(&weight),
-            silhouette: None,
-            window: [0.0, 0.0, 63.0, 63.0],
-            projection: projection(),
-            focal: 60.0,
-        };
+        let view = view(&depth, &weight, None);
         let params = FusionParams { smoothing: 1.5, ..PARAMS };
         let grid = Grid::new([-1.0; 3], 0.03, [67; 3]).unwrap();
         let whole = fuse(grid, &[view], &params).unwrap();
@@ -483,15 +471,7 @@ mod tests {
     #[test]
     fn too_large_a_volume_is_refused() {
         let (depth, weight) = (vec![4.0f32; 64 * 64], vec![1.0f32; 64 * 64]);
-        let raster = |d| Raster::new(d, 64, 64, "depth").unwrap();
-        let view = FusionView {
-            depth: raster(&depth),
-            weight: raster(&weight),
-            silhouette: None,
-            window: [0.0, 0.0, 63.0, 63.0],
-            projection: projection(),
-            focal: 60.0,
-        };
+        let view = view(&depth, &weight, None);
         let error = fuse(grid(), &[view], &FusionParams { max_memory: 4000, ..PARAMS }).unwrap_err();
         assert!(matches!(error, Error::OutOfMemory { .. }));
     }

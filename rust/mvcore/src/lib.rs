@@ -33,5 +33,7 @@ pub mod shade;
 pub mod slanted;
 pub mod smooth;
 pub mod sweep;
+#[cfg(test)]
+mod testing;
 
 pub use error::{Error, Result};
