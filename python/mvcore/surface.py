@@ -110,7 +110,8 @@ def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool =
     return surface
 
 
-def _compact(vertices: Float, faces: Faces) -> Surface:
+def compact(vertices: Float, faces: Faces) -> Surface:
+    """A surface of these faces alone, without the vertices that none of them has."""
     return Surface(*_used(vertices, faces))
 
 
@@ -128,7 +129,7 @@ def drop_small_parts(surface: Surface, share: float) -> Surface:
         return surface
     part = _core.components(surface.faces)
     size = np.bincount(part)
-    return _compact(surface.vertices, surface.faces[size[part] >= share * size.max()])
+    return compact(surface.vertices, surface.faces[size[part] >= share * size.max()])
 
 
 def drop_cavities(surface: Surface) -> Surface:
@@ -136,7 +137,7 @@ def drop_cavities(surface: Surface) -> Surface:
     part = _core.components(surface.faces)
     a, b, c = (surface.vertices[surface.faces[:, k]] - surface.vertices.mean(0) for k in range(3))
     volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)))
-    return _compact(surface.vertices, surface.faces[volume[part] > 0])
+    return compact(surface.vertices, surface.faces[volume[part] > 0])
 
 
 def smooth(surface: Surface, rounds: int) -> Surface:
@@ -167,4 +168,4 @@ def decimate(surface: Surface, max_faces: int) -> Surface:
     scale = np.abs(surface.vertices - center).max()
     points = ((surface.vertices - center) / scale).astype(np.float32)
     v, f = fast_simplification.simplify(points, surface.faces.astype(np.int32), target_count=max_faces)
-    return _compact(v.astype(np.float64) * scale + center, f.astype(np.uint32))
+    return compact(v.astype(np.float64) * scale + center, f.astype(np.uint32))

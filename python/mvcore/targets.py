@@ -14,7 +14,7 @@ from .cameras import Camera
 from .carve import Mask, Occupancy, splat
 from .motion import align, cloud_of_mesh
 from .result import Reconstruction
-from .surface import Surface, marching_cubes
+from .surface import Surface, compact, marching_cubes
 
 Float = NDArray[np.float64]
 Target = Mapping[str, Any]
@@ -49,8 +49,12 @@ class Hulls:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it by name, to be stored."""
-        named = {"hull_vertices": self.vertices, "hull_faces": self.faces, "hull_owner": self.owner}
-        return named | {"hull_voxel": np.array(self.voxel)}
+        return {
+            "hull_vertices": self.vertices,
+            "hull_faces": self.faces,
+            "hull_owner": self.owner,
+            "hull_voxel": np.array(self.voxel),
+        }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Hulls:
@@ -79,23 +83,22 @@ def find_targets(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camer
         if every[number] < max(LEAST_PART * every.max(), 1.0):
             break
         own = np.ascontiguousarray(vertices[np.unique(faces[part == number])])
-        shadows = [(splat(own, hull.voxel, c) > 0) & (m > 0) for c, m in zip(cameras, masks, strict=True)]
-        alone = max(np.count_nonzero(s & ~o) / max(1, np.count_nonzero(s)) for s, o in zip(shadows, shown, strict=True))
-        if alone < SEEN_ALONE:
+        shadows = [(splat(own, hull.voxel, camera) > 0) & (m > 0) for camera, m in zip(cameras, masks, strict=True)]
+        if all(np.count_nonzero(s & ~o) <= SEEN_ALONE * np.count_nonzero(s) for s, o in zip(shadows, shown, strict=True)):
             continue
         close = [n for n, body in enumerate(bodies) if (_core.nearest(own, body, JOINED * _length(body))[1] >= 0).any()]
         if close:
-            number_of = close[0]
-            bodies[number_of] = np.concatenate([bodies[number_of], own])
-            volumes[number_of] += float(every[number])
+            target = close[0]
+            bodies[target] = np.concatenate([bodies[target], own])
+            volumes[target] += float(every[number])
         elif every[number] >= least * every.max():
-            number_of = len(bodies)
+            target = len(bodies)
             bodies.append(own)
             volumes.append(float(every[number]))
         else:
             continue
         shown = [s | o for s, o in zip(shadows, shown, strict=True)]
-        owner[part == number] = number_of
+        owner[part == number] = target
     found = []
     for body, volume in zip(bodies, volumes, strict=True):
         box = [(body.min(0) - hull.voxel).tolist(), (body.max(0) + hull.voxel).tolist()]
@@ -114,9 +117,7 @@ def on_targets(surface: Surface, hulls: Hulls) -> Surface:
     hull = np.ascontiguousarray(hulls.vertices[hulls.faces].mean(1))
     near = _core.nearest(middles, hull, 3 * hulls.voxel)[1] >= 0
     share = np.bincount(part, near) / np.bincount(part)
-    kept = surface.faces[(share > 0.5)[part]]
-    used, index = np.unique(kept, return_inverse=True)
-    return Surface(surface.vertices[used], index.reshape(-1, 3).astype(np.uint32))
+    return compact(surface.vertices, surface.faces[(share > 0.5)[part]])
 
 
 def _size(target: Target) -> float:
