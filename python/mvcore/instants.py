@@ -137,17 +137,18 @@ def learn(job: Job) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         if missing:
             chosen = learning_samples(job)
             require(len(chosen) >= 3, "background", "a clean plate of every camera, or at least 3 instants to learn it from", len(chosen))
-            frames = [[job.clips.undistorted_frame(n, int(t)) for t in chosen[:, n]] for n in missing]
-            learnt = dict(
-                zip(
-                    missing, learn_backgrounds(frames, [cameras[n] for n in missing], box, job.config.target, job.config.carve), strict=True
-                )
-            )
+            frames, reduced = [], []
+            for n in missing:  # reduced at once: whole clips of large frames would not fit into memory
+                pairs = [reduce(job.clips.undistorted_frame(n, int(t)), cameras[n], job.config.target.max_size) for t in chosen[:, n]]
+                frames.append([p[0] for p in pairs])
+                reduced.append(pairs[0][1])
+            found = learn_backgrounds(frames, reduced, box, job.config.target, job.config.carve)
+            learnt = dict(zip(missing, found, strict=True))
         for n, plate in enumerate(job.plates):
-            found = learnt[n] if plate is None else Background.from_plate(plate)
+            own = learnt[n] if plate is None else Background.from_plate(plate)
             road = job.roads[n]
-            region = found.region if road is None else found.region & (_resized(road, found.region.shape) > 0)
-            arrays |= {f"plate{n}": found.plate, f"known{n}": found.known, f"region{n}": region}
+            region = own.region if road is None else own.region & (_resized(road, own.region.shape) > 0)
+            arrays |= {f"plate{n}": own.plate, f"known{n}": own.known, f"region{n}": region}
     meta = {"report": report.values, "warnings": report.warnings}
     return arrays, meta
 
