@@ -15,7 +15,7 @@ from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.cost import correlate, cost_space, scaled_maps, unit
 from mvcore.network.datasets import LAYOUTS, cropped, find_items
 from mvcore.network.logs import plot_log
-from mvcore.network.match import Matcher, folded, padded
+from mvcore.network.match import MOST_SEEN, Matcher, folded, padded
 from mvcore.network.model import DisparityNet
 from mvcore.network.recognition import SHIPPED, TargetClassifier, load_classifier, rank_1, squared_error
 from mvcore.network.targets import SIZE, Target
@@ -87,6 +87,25 @@ def test_shipped_network_finds_the_depth_of_held_out_families():
         random_guess.append((np.abs(np.median(truth) - truth) < near)[truth > 0].mean())
     assert np.mean(right) > 0.6
     assert np.mean(right) > np.mean(random_guess) + 0.2
+
+
+def test_features_are_kept_and_change_nothing(ring):
+    cameras, images, _depths, _masks = ring
+    looked = []
+    matcher = Matcher()
+    look = matcher.net.look
+    matcher.net.look = lambda image: looked.append(image.shape) or look(image)
+    first = matcher.depth(images[0], cameras[0], images[1:3], cameras[1:3], 1.2, 2.6)
+    assert len(looked) == 3
+    matcher.depth(images[1], cameras[1], [images[0], images[2], images[3]], [cameras[n] for n in (0, 2, 3)], 1.2, 2.6)
+    assert len(looked) == 4
+    again = matcher.depth(images[0], cameras[0], images[1:3], cameras[1:3], 1.2, 2.6)
+    alone = Matcher().depth(images[0], cameras[0], images[1:3], cameras[1:3], 1.2, 2.6)
+    for found in (again, alone):
+        assert all(np.array_equal(a, b) for a, b in zip(first, found))
+    for n in range(30):
+        matcher._look(np.full((16, 16, 3), n, np.uint8))
+    assert len(matcher.seen) == MOST_SEEN
 
 
 def test_matcher_names_what_is_wrong():

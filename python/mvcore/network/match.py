@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -15,7 +18,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ..cameras import Camera, relative_map
 from ..errors import require
-from .model import DisparityNet
+from .model import DisparityNet, Looks
 from .weights import load_disparity
 
 Image = NDArray[np.uint8]
@@ -46,6 +49,9 @@ class Matcher:
         require(device == "cpu" or torch.cuda.is_available(), "device", "cpu, for torch finds no CUDA device", device)
         self.device = torch.device(device)
         self.net: DisparityNet = folded(load_disparity(weights or SHIPPED)).to(self.device)
+        self.seen: OrderedDict[bytes, Looks] = OrderedDict()
+        """Features of the images looked at last: a view is the source of many others."""
+        self._lock = Lock()
 
     def depth(
         self,
@@ -76,12 +82,32 @@ class Matcher:
     @torch.no_grad()
     def _run(self, images: Sequence[Image], maps: Sequence[Map], low: float, high: float, planes: int) -> tuple[Map, Map]:
         h, w = images[0].shape[:2]
-        tensors = [padded(i).to(self.device) for i in images]
+        looks = [self._look(i) for i in images]
         ways = [torch.from_numpy(np.ascontiguousarray(m, np.float32))[None].to(self.device) for m in maps]
         ends = [torch.tensor([x], dtype=torch.float32, device=self.device) for x in (low, high)]
-        found = self.net(tensors[0], tensors[1:], ways, ends[0], ends[1], planes)
+        found = self.net.compare(looks, ways, ends[0], ends[1], planes)
         inverse, confidence = (t[0, :h, :w].float().cpu().numpy() for t in (found.inverse, found.confidence))
         return np.ascontiguousarray(inverse.clip(low, high)), np.ascontiguousarray(confidence)
+
+    def _look(self, image: Image) -> Looks:
+        """An image's features, alone so that they are the same bits in whatever company."""
+        tensor = padded(image)
+        key = hashlib.blake2b(tensor.numpy().tobytes(), digest_size=16).digest() + str(tuple(tensor.shape)).encode()
+        with self._lock:
+            known = self.seen.get(key)
+            if known is not None:
+                self.seen.move_to_end(key)
+                return known
+        found = self.net.look(tensor.to(self.device))
+        with self._lock:
+            self.seen[key] = found
+            while len(self.seen) > MOST_SEEN:
+                self.seen.popitem(last=False)
+        return found
+
+
+MOST_SEEN = 24
+"""Images whose features are kept: those of a rig's neighbourhood, some 5 MB each."""
 
 
 def folded(net: DisparityNet) -> DisparityNet:

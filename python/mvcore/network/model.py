@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,10 @@ COARSE_CHANNELS, FINE_CHANNELS = (16, 32, 48), (8, 16, 32)
 FINE_PLANES = 8
 FINE_RATIO = 0.25
 """Interval of the second stage's planes in intervals of the first's."""
+
+
+Looks = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Features of an image: for the cost space at quarter and half size, and for the hourglasses there."""
 
 
 @dataclass
@@ -74,8 +79,15 @@ class DisparityNet(nn.Module):
         reference : (B, 3, H, W) of 0 .. 255, sides divisible by 16; sources : likewise, one each.
         maps : (B, 12) relative maps reference to source for full-size pixels; low, high : (B,) inverse depths; planes : of the first stage.
         """
-        images = [reference, *sources]
-        quarter, half, context, detail = zip(*(self._features(images)), strict=True)
+        return self.compare(self._features([reference, *sources]), maps, low, high, planes)
+
+    def look(self, image: Tensor) -> Looks:
+        """Features of one image (1, 3, H, W): what `compare` takes of it, whatever it is compared with."""
+        return self._features([image])[0]
+
+    def compare(self, looks: Sequence[Looks], maps: list[Tensor], low: Tensor, high: Tensor, planes: int) -> Prediction | Training:
+        """The rest of the way, from the features of the reference view and of its sources. Parameters as of `forward`."""
+        quarter, half, context, detail = zip(*looks, strict=True)
         step = (high - low) / (planes - 1)
         number = torch.arange(planes, device=low.device, dtype=torch.float32)
         b, _c, h, w = quarter[0].shape
@@ -105,7 +117,7 @@ class DisparityNet(nn.Module):
         plane, confidence = windowed_soft_argmin(scores)
         return (plane if self.windowed else soft_argmin(scores)), confidence
 
-    def _features(self, images: list[Tensor]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    def _features(self, images: list[Tensor]) -> list[Looks]:
         if all(i.shape == images[0].shape for i in images):
             together = self.features(normalised(torch.cat(images)))
             return list(zip(*(t.chunk(len(images)) for t in together), strict=True))
