@@ -255,6 +255,16 @@ def test_an_instant_without_a_target_is_empty(tmp_path):
     assert np.median(errors(full, POSES[0])) < 0.01
 
 
+def test_equal_instants_in_several_chains_do_not_take_each_others_results_away():
+    cameras = rig(12, (96, 72))
+    frames = {f"c{n}": np.stack([render_target(c, POSES[0])[0]] * 12) for n, c in enumerate(cameras)}
+    plates = {f"c{n}": render_target(c)[0] for n, c in enumerate(cameras)}
+    settings = SETTINGS | {"video": {"segment": 3, "chains": 3}}
+    found = list(reconstruct_video(load_video(frames, cameras, rates=25), background=plates, config=settings))
+    assert len(found) == 12
+    assert all(len(r.faces) for r in found)
+
+
 def test_masks_bounds_and_calibration_may_be_given(folder):
     cameras = rig(12)
     masks = {f"cam{n:02d}": np.stack([render_target(c, p)[1] for p in POSES]) for n, c in enumerate(cameras)}

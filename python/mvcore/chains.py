@@ -253,16 +253,19 @@ class _Chain:
         meta = stored(job, prepare).meta
         if meta["empty"]:
             return _Done(t, prepare, {}, "", None, time.perf_counter() - started)
-        expect = None
-        if before is not None and before.mesh is not None:
-            expect = digest("expect", prepare, before.mesh)
-            if expect not in job.store:
-                pool.start(work.expect, job, expect, prepare, before.mesh, before.prepare)()
+        begun = None if before is None or before.mesh is None else digest("expect", prepare, before.mesh)
+        # What is removed again bears the instant's number: another chain may be at the same frames.
+        expect = None if begun is None else digest(begun, t)
         used = [n for n, s in enumerate(meta["sources"]) if s]
-        fuse = digest("fuse", prepare, expect)
-        seconds = {n: digest("second", prepare, n, expect) for n in used}
+        fuse = digest("fuse", prepare, begun)
+        mesh = digest("mesh", fuse, begun, gains)
+        seconds = {n: digest("second", prepare, n, begun) for n in used}
+        if fuse in job.store and mesh in job.store:
+            return _Done(t, prepare, seconds, fuse, mesh, time.perf_counter() - started)
+        if before is not None and expect is not None and expect not in job.store:
+            pool.start(work.expect, job, expect, prepare, before.mesh, before.prepare)()
         if fuse not in job.store:
-            firsts = {n: digest("first", prepare, n, expect) for n in used}
+            firsts = {n: digest("first", prepare, n, begun, t) for n in used}
 
             def first(n: int) -> Callable[[], Any]:
                 return pool.start(work.first, job, firsts[n], prepare, n, expect)
@@ -272,6 +275,7 @@ class _Chain:
 
             _match(job, firsts, seconds, first, second)
             pool.start(work.fuse, job, fuse, prepare, seconds)()
-        mesh = digest("mesh", fuse, expect, gains)
         pool.start(work.mesh, job, mesh, prepare, fuse, expect, gains)()
+        if expect is not None:
+            job.store.path(expect).unlink(missing_ok=True)
         return _Done(t, prepare, seconds, fuse, mesh, time.perf_counter() - started)

@@ -304,7 +304,7 @@ def prepared(job: Job, key: str) -> tuple[Views, Plan, Entry]:
 @once
 def expect(job: Job, prepare_key: str, mesh_key: str, before_key: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """What the surface of the instant before leads to expect: the targets' motion since, and the depth of each view."""
-    views, _, entry = prepared(job, prepare_key)
+    views, plan, entry = prepared(job, prepare_key)
     mesh, before = stored(job, mesh_key), stored(job, before_key)
     poses = np.zeros((0, 4, 4))
     vertices = mesh.arrays["vertices"]
@@ -314,6 +314,8 @@ def expect(job: Job, prepare_key: str, mesh_key: str, before_key: str) -> tuple[
         vertices = moved(vertices, poses, hulls)
     arrays: dict[str, NDArray[Any]] = {"poses": poses}
     for n, camera in enumerate(views.cameras):
+        if not plan.sources[n]:
+            continue
         seed, _ = _core.rasterize(np.ascontiguousarray(vertices), mesh.arrays["faces"], camera.projection, camera.width, camera.height)
         arrays[f"seed{n}"] = seed
     centers = np.ascontiguousarray(vertices[mesh.arrays["faces"]].mean(1))

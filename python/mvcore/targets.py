@@ -37,29 +37,23 @@ MEMORY = 5
 
 @dataclass(frozen=True)
 class Hulls:
-    """The surfaces of all targets' hulls.
+    """The surfaces of all parts of the hull.
 
-    vertices : (V, 3) float64, world. faces : (F, 3) uint32. owner : (F,) int32, the target of each face. voxel : of the hulls.
+    vertices : (V, 3) float64, world. faces : (F, 3) uint32. owner : (F,) int32, the target of each face, -1 of phantoms and noise.
     """
 
     vertices: Float
     faces: NDArray[np.uint32]
     owner: NDArray[np.int32]
-    voxel: float
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it by name, to be stored."""
-        return {
-            "hull_vertices": self.vertices,
-            "hull_faces": self.faces,
-            "hull_owner": self.owner,
-            "hull_voxel": np.array(self.voxel),
-        }
+        return {"hull_vertices": self.vertices, "hull_faces": self.faces, "hull_owner": self.owner}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Hulls:
         """What `arrays` gave."""
-        return cls(arrays["hull_vertices"], arrays["hull_faces"], arrays["hull_owner"], float(arrays["hull_voxel"]))
+        return cls(arrays["hull_vertices"], arrays["hull_faces"], arrays["hull_owner"])
 
 
 def find_targets(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camera], least: float) -> tuple[list[dict[str, Any]], Hulls]:
@@ -103,7 +97,7 @@ def find_targets(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camer
     for body, volume in zip(bodies, volumes, strict=True):
         box = [(body.min(0) - hull.voxel).tolist(), (body.max(0) + hull.voxel).tolist()]
         found.append({"middle": body.mean(0).tolist(), "box": box, "volume": volume * hull.voxel**3})
-    return found, Hulls(vertices, faces[owner >= 0], owner[owner >= 0], hull.voxel)
+    return found, Hulls(vertices, faces, owner)
 
 
 def _length(points: Float) -> float:
@@ -111,13 +105,19 @@ def _length(points: Float) -> float:
 
 
 def on_targets(surface: Surface, hulls: Hulls) -> Surface:
-    """The connected parts of a surface that are a target's, without phantoms."""
+    """The surface without its connected parts that lie in phantoms rather than in targets."""
+    if (hulls.owner >= 0).all():
+        return surface
     part = _core.components(surface.faces)
-    middles = np.ascontiguousarray(surface.vertices[surface.faces].mean(1))
-    hull = np.ascontiguousarray(hulls.vertices[hulls.faces].mean(1))
-    near = _core.nearest(middles, hull, 3 * hulls.voxel)[1] >= 0
-    share = np.bincount(part, near) / np.bincount(part)
+    near = hulls.owner[_nearest_face(surface.vertices[surface.faces].mean(1), hulls, np.ones(len(hulls.owner), bool))]
+    share = np.bincount(part, near >= 0) / np.bincount(part)
     return compact(surface.vertices, surface.faces[(share > 0.5)[part]])
+
+
+def _nearest_face(points: Float, hulls: Hulls, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Which of the chosen faces of the hulls is nearest to each point."""
+    middles = np.ascontiguousarray(hulls.vertices[hulls.faces[chosen]].mean(1))
+    return np.flatnonzero(chosen)[_core.nearest(np.ascontiguousarray(points), middles)[1]]
 
 
 def _size(target: Target) -> float:
@@ -157,8 +157,7 @@ def moved(points: Float, poses: Float, hulls: Hulls) -> Float:
         return points
     owner = np.zeros(len(points), np.int32)
     if len(poses) > 1:
-        middles = np.ascontiguousarray(hulls.vertices[hulls.faces].mean(1))
-        owner = hulls.owner[_core.nearest(np.ascontiguousarray(points), middles)[1]]
+        owner = hulls.owner[_nearest_face(points, hulls, hulls.owner >= 0)]
     out = points.copy()
     for k, pose in enumerate(poses):
         out[owner == k] = points[owner == k] @ pose[:3, :3].T + pose[:3, 3]
