@@ -9,6 +9,7 @@ use mvcore::aggregate::{Penalties, aggregate};
 use mvcore::atlas::{Source, build_atlas};
 use mvcore::carve::{CarveParams, Silhouette, carve};
 use mvcore::consistency::{ConsistencyParams, OtherView, consistency};
+use mvcore::expect::expect;
 use mvcore::fuse::{FusionParams, FusionView, fuse};
 use mvcore::grid::Grid;
 use mvcore::isosurface::{isosurface_dense, isosurface_sparse};
@@ -91,6 +92,9 @@ fn stereo(c: &mut Criterion) {
     let penalties = Penalties { p1: 6, p2: 60, p2_falloff: 12 };
     group.throughput(Throughput::Bytes((w * h * d) as u64));
     group.bench_function("aggregate 1280x960x128", |b| b.iter(|| aggregate(&costs, d, guide, penalties).unwrap()));
+    let mut volume = costs.clone();
+    let (expected, sure): (Vec<f32>, Vec<f32>) = (0..w * h).map(|i| (disparity(i % w), random.next() as f32)).unzip();
+    group.bench_function("expect 1280x960x128", |b| b.iter(|| expect(&mut volume, d, &expected, &sure, 20.0, 4.0)));
     group.finish();
 }
 

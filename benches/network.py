@@ -25,8 +25,9 @@ import numpy as np
 import torch
 from mvcore import depth as depth_stage
 from mvcore import metrics, sparse
-from mvcore.config import Config, DepthConfig
+from mvcore.config import MATCHERS, Config
 from mvcore.io.images import load_frame
+from mvcore.network import match
 from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.match import SHIPPED, Matcher, planes_for, shipped_matcher
 from mvcore.network.train_disparity import Training, train_disparity, validate
@@ -75,9 +76,7 @@ def _compared(matcher, pairs):
     for name, left, right, truth, clear in pairs:
         most = int(np.ceil((truth[np.isfinite(truth)].max() + 1) / 16) * 16)
         raw, sure = matcher.disparity(left, right, most)
-        grey = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in (left, right)]
-        fine = depth_stage.polished(raw, *grey, (0, most), DepthConfig())
-        found = {"network": raw, "polished": fine, "sgm": mvcore.disparity(left, right, max_disparity=most)[0]}
+        found = {"network alone": raw} | {k: mvcore.disparity(left, right, max_disparity=most, matcher=k)[0] for k in MATCHERS}
         peer = cv2.StereoSGBM_create(0, most, 5, 8 * 75, 32 * 75, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH)
         found["HH"] = peer.compute(left[..., ::-1].copy(), right[..., ::-1].copy()).astype(np.float32) / 16
         bad = {k: metrics.disparity_metrics(d, truth)["bad_2"] for k, d in found.items()}
@@ -141,8 +140,7 @@ def views(arguments):
         sources = sparse.choose_sources(sparse.view_scores(cameras, points, box, config.depth), config.depth.sources)
         gray = [depth_stage.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
         scale = json.loads((folder / "cameras.json").read_text())["depth_scale"]
-        shares = {"network": [], "network, polished": [], "sgm": []}
-        shipped_matcher.cache_clear()
+        shares = {"network alone": [], "dcnn": [], "sgm": []}
         for n in np.unique(np.linspace(0, len(images) - 1, arguments.count).astype(int)):
             truth = _truth(folder, scene.frames[n], "depth").astype(np.float32) * scale
             mask = _truth(folder, scene.frames[n], "masks") > 0
@@ -150,8 +148,8 @@ def views(arguments):
             inverse, _ = matcher.depth(images[n], cameras[n], [v.colour for v in near[:4]], [v.camera for v in near[:4]], *ranges[n])
             rough = depth_stage.network_depth(gray[n], near, *ranges[n])
             found = {
-                "network": 1 / np.maximum(inverse, 1e-9),
-                "network, polished": depth_stage.refine_depth(gray[n], near, rough, ()).depth,
+                "network alone": 1 / np.maximum(inverse, 1e-9),
+                "dcnn": depth_stage.refine_depth(gray[n], near, rough, ()).depth,
                 "sgm": depth_stage.estimate_depth(gray[n], near, *ranges[n]).depth,
             }
             for name, depth in found.items():
@@ -217,6 +215,7 @@ def main():
     parser.add_argument("--weights", type=Path, default=SHIPPED)
     parser.add_argument("--count", type=int, default=4, help="views of each scene")
     arguments = parser.parse_args()
+    match.SHIPPED = arguments.weights
     jobs[arguments.job](arguments)
 
 

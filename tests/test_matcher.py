@@ -8,7 +8,7 @@ import mvcore
 import numpy as np
 import pytest
 import torch
-from mvcore import FormatError, InvalidInputError, depth
+from mvcore import FormatError, InvalidInputError, _core, depth
 from mvcore.cameras import relative_map
 from mvcore.io.maps import write_pfm
 from mvcore.network.batches import Recipe, make_batch
@@ -137,6 +137,36 @@ def test_pipeline_runs_with_the_network_and_says_so(ring):
     assert len(result.faces) > 100
 
 
+def test_network_helps_the_sweep_where_it_was_never_trained():
+    bad = {"sgm": [], "dcnn": []}
+    for number in range(4):
+        batch = make_batch(Recipe(seed=78, batch=1, held_out=True, pairs=1.0), number)
+        left, right = (i[0].permute(1, 2, 0).numpy() for i in batch.images)
+        truth, most = batch.inverse[0].numpy(), int(np.ceil(float(batch.high[0])))
+        for matcher, shares in bad.items():
+            found, _ = mvcore.disparity(left, right, max_disparity=most, matcher=matcher)
+            shares.append((np.abs(found - truth) > 2)[(truth > 0) & (truth < most)].mean())
+    assert np.mean(bad["dcnn"]) < 0.9 * np.mean(bad["sgm"])
+
+
+def test_expected_depth_is_a_bounded_term_of_the_costs():
+    random = np.random.default_rng(0)
+    costs = random.integers(0, 64, (5, 7, 20), np.uint8)
+    place = random.uniform(0, 19, (5, 7)).astype(np.float32)
+    sure = random.uniform(0, 1, (5, 7)).astype(np.float32)
+    sure[0] = 0
+    place[1, 0] = np.nan
+    after = costs.copy()
+    _core.expect(after, place, sure, 20.0, 6.0)
+    term = 20 * sure[..., None] * np.minimum(np.abs(np.arange(20) - place[..., None]) / 6, 1)
+    assert np.abs(after.astype(float) - costs - np.nan_to_num(term)).max() <= 0.51
+    assert np.array_equal(after[0], costs[0])
+    for wrong in ({"weight": 90.0}, {"reach": 0.0}, {"expected": place[:2]}, {"confidence": sure[:2]}):
+        name = next(iter(wrong))
+        with pytest.raises(InvalidInputError, match=f"^{name}: expected"):
+            _core.expect(costs, **({"expected": place, "confidence": sure, "weight": 20.0, "reach": 6.0} | wrong))
+
+
 def test_network_disparity_fills_or_leaves_out_what_is_hidden():
     batch = make_batch(Recipe(seed=5, batch=1, pairs=1.0), 1)
     left, right = (i[0].permute(1, 2, 0).numpy() for i in batch.images)
@@ -146,7 +176,7 @@ def test_network_disparity_fills_or_leaves_out_what_is_hidden():
     assert (full > 0).mean() > 0.99
     assert 0.2 < (checked > 0).mean() < 1
     assert np.array_equal(full[checked > 0], checked[checked > 0])
-    assert (confidence[checked == 0] == np.float32(0.01)).all()
+    assert (confidence[(checked == 0) & (full > 0)] == np.float32(0.01)).all()
 
 
 def test_a_target_is_the_same_from_its_seed_and_differs_from_others():

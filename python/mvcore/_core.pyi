@@ -13,6 +13,7 @@ __all__ = [
     "consistency",
     "correlate",
     "encode_png",
+    "expect",
     "fuse",
     "isosurface_dense",
     "isosurface_sparse",
@@ -46,6 +47,7 @@ _I64 = NDArray[np.int64]
 
 def sweep(reference: _U8, images: Sequence[_U8], maps: _F32, planes: _F32, best: int = 0) -> _U8: ...
 def aggregate(costs: _U8, guide: _U8, p1: int, p2: int, p2_falloff: int) -> tuple[_F32, _F32]: ...
+def expect(costs: _U8, expected: _F32, confidence: _F32, weight: float, reach: float) -> None: ...
 def correlate(reference: _F32, sources: Sequence[_F32], maps: _F32, planes: _F32, gain: _F32, bias: float) -> _F32: ...
 def refine(
     reference: _U8,

@@ -76,7 +76,7 @@ def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: 
     return settings
 
 
-Matcher = Annotated[str, typer.Option(help="Depth matcher: sgm (classical) or dcnn (the network).")]
+Matcher = Annotated[str, typer.Option(help="Depth matcher: sgm (classical) or dcnn (with the network).")]
 Device = Annotated[str, typer.Option(help="Where the network runs: cpu or cuda.")]
 
 

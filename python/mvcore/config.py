@@ -61,6 +61,10 @@ class DepthConfig:
     """Rounds of slanted refinement at the sweep's scale, where they are cheap."""
     rounds: int = 1
     """Rounds at each finer scale."""
+    network_weight: float = 20.0
+    """With the network: cost units, at full confidence, of a plane far from what it found."""
+    network_reach: float = 6.0
+    """Planes at which that cost stops growing."""
     max_slant: float = 76.0
     """Degrees between a surface's normal and the view: flatter surfaces cannot be matched."""
     prior_weight: float = 0.1
@@ -231,7 +235,7 @@ class Config:
     texture: TextureConfig = field(default_factory=TextureConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     matcher: str = "sgm"
-    """The depth matcher: ``sgm`` is the classical one, ``dcnn`` the network; the default measured better on exact truth."""
+    """The depth matcher: ``sgm`` is the classical one, ``dcnn`` asks the network as well: a little better, twice the time."""
     device: str = "cpu"
     """Where the network runs: ``cpu``, or ``cuda`` where torch finds such a device."""
 

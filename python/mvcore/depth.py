@@ -1,7 +1,7 @@
 """Depth maps: plane sweep, semi-global aggregation, slanted refinement, and consistency across views.
 
-Two matchers find a view's rough depth, ``sgm`` and the network ``dcnn``; the second pass polishes either. The classical one goes
-coarse to fine: the sweep and the aggregation run on a small image, where they see the most context;
+Two matchers find a view's rough depth: ``sgm`` is the classical one; in ``dcnn`` what the network finds is one more term of
+its costs. Either goes coarse to fine: the sweep and the aggregation run on a small image, where they see the most context;
 planes are then refined on it and on each finer scale up to the full size. A rectified pair is the same code with horizontal
 homographies.
 """
@@ -134,29 +134,37 @@ class _Hypotheses:
     step: float
 
 
-def _aggregated(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig) -> tuple[Map, Map]:
+@dataclass(frozen=True)
+class _Expected:
+    """Inverse depth that the network found, (h, w) float32, and how sure it is of it, 0 .. 1."""
+
+    inverse: Map
+    confidence: Map
+
+
+def _aggregated(
+    scale: _Scale, low: float, high: float, planes: int, config: DepthConfig, expected: _Expected | None = None
+) -> tuple[Map, Map]:
     """Inverse depth and margin of the semi-global solution among ``planes`` planes."""
     inverse = np.linspace(low, high, planes, dtype=np.float32)
     costs = _core.sweep(scale.greys[0], scale.greys[1:], scale.there, inverse)
+    if expected is not None:
+        place = (expected.inverse - np.float32(low)) / (inverse[1] - inverse[0])
+        _core.expect(costs, place, expected.confidence, config.network_weight, config.network_reach)
     index, margin = _core.aggregate(costs, scale.greys[0], config.p1, config.p2, config.p2_falloff)
     return (low + index * float(inverse[1] - inverse[0])).astype(np.float32), margin
 
 
-def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig) -> _Hypotheses:
+def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig, expected: _Expected | None = None) -> _Hypotheses:
     """Sweep, aggregate, refine at one scale."""
-    prior, margin = _aggregated(scale, low, high, planes, config)
-    return _around(scale, prior, margin, (low, high), (high - low) / (planes - 1), config)
+    prior, margin = _aggregated(scale, low, high, planes, config, expected)
+    return _refined(scale, _start(prior), prior, margin, (low, high), (high - low) / (planes - 1), config)
 
 
 def _start(inverse: Map) -> Map:
     """Slanted planes (h, w, 4) through a map of inverse depths."""
     a, b = _slopes(inverse)
     return np.stack([inverse, a, b, np.zeros_like(a)], -1)
-
-
-def _around(scale: _Scale, prior: Map, margin: Map, span: tuple[float, float], step: float, config: DepthConfig) -> _Hypotheses:
-    """Slanted planes refined around a first solution."""
-    return _refined(scale, _start(prior), prior, margin, span, step, config)
 
 
 def _refined(
@@ -249,7 +257,11 @@ def sweep_depth(reference: View, sources: Sequence[View], near: float, far: floa
     config = config or DepthConfig()
     _check(sources, near, far)
     coarsest, *finer = _pyramid(reference, sources, config)
-    found = _sweep(coarsest, 1 / far, 1 / near, config.planes, config)
+    return _carried(_sweep(coarsest, 1 / far, 1 / near, config.planes, config), finer, config)
+
+
+def _carried(found: _Hypotheses, finer: Sequence[_Scale], config: DepthConfig) -> RoughDepth:
+    """A first pass brought from the coarsest scale up to half the size."""
     for scale in finer[:-1]:
         found = _finer(found, scale, config.rounds, config)
     return RoughDepth(found)
@@ -291,9 +303,7 @@ def seeded_depth(
     better = ~expected | (costs[1] < costs[0])
     prior = np.where(better, swept, inverse)
     found = _refined(coarsest, np.where(better[..., None], two, one), prior, np.where(better, sweep_margin, margin), span, step, config)
-    for scale in finer[:-1]:
-        found = _finer(found, scale, config.rounds, config)
-    return RoughDepth(found)
+    return _carried(found, finer, config)
 
 
 def _filled(depth: Map) -> Map:
@@ -311,7 +321,10 @@ NETWORK_SIDE = 576
 def network_depth(
     reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None, device: str = "cpu"
 ) -> RoughDepth:
-    """First pass by the network. Parameters and errors as of `sweep_depth`; views need colours; ``device`` is ``cpu`` or ``cuda``."""
+    """First pass with the network: what it finds is a term of the sweep's costs, so that both must err for a pixel to be wrong.
+
+    Parameters and errors as of `sweep_depth`; views need colours; ``device`` is ``cpu`` or ``cuda``.
+    """
     from .network.match import shipped_matcher
 
     config = config or DepthConfig()
@@ -319,15 +332,12 @@ def network_depth(
     share = min(1.0, NETWORK_SIDE / max(reference.grey.shape))
     images, cameras = zip(*(_coloured(v, n, share) for n, v in enumerate([reference, *sources[:NETWORK_SOURCES]])), strict=True)
     inverse, confidence = shipped_matcher(device).depth(images[0], cameras[0], images[1:], cameras[1:], near, far)
-    # From here on it is what the aggregation's solution is to the classical matcher.
     coarsest, *finer = _pyramid(reference, sources, config)
     h, w = coarsest.greys[0].shape
-    prior = cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
-    margin = cv2.resize(confidence, (w, h), interpolation=cv2.INTER_LINEAR) / 4
-    found = _around(coarsest, prior, margin, (1 / far, 1 / near), (1 / near - 1 / far) / (config.planes - 1), config)
-    for scale in finer[:-1]:
-        found = _finer(found, scale, config.rounds, config)
-    return RoughDepth(found)
+    expected = _Expected(
+        cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST), cv2.resize(confidence, (w, h), interpolation=cv2.INTER_LINEAR)
+    )
+    return _carried(_sweep(coarsest, 1 / far, 1 / near, config.planes, config, expected), finer, config)
 
 
 NETWORK_SOURCES = 4
@@ -432,7 +442,7 @@ def disparity(
     left, right : (h, w) or (h, w, 3) uint8, the same size.
     max_disparity, min_disparity : pixels; a point at column x of the left image stands at x - d of the right one.
     fill : replace what the right image does not confirm by the surrounding background; otherwise it is 0.
-    matcher : ``sgm``, or ``dcnn`` for the network, which fills what is hidden itself.
+    matcher : ``sgm``, or ``dcnn`` for the network beside it.
     device : ``cpu`` or ``cuda``, of the network.
 
     Returns
@@ -453,9 +463,8 @@ def disparity(
     require(images[0].shape == images[1].shape, "right", f"the size of left {images[0].shape}", images[1].shape)
     require(max_disparity > min_disparity, "max_disparity", f"more than min_disparity ({min_disparity})", max_disparity)
     require(matcher in MATCHERS, "matcher", f"one of {', '.join(MATCHERS)}", repr(matcher))
-    if matcher == "dcnn":
-        return _network_disparity(images, (left, right), min_disparity, max_disparity, fill, device, config)
-    mine = _rectified(images[0], images[1], min_disparity, max_disparity, config)
+    expected = _expected((left, right), min_disparity, max_disparity, device) if matcher == "dcnn" else None
+    mine = _rectified(images[0], images[1], min_disparity, max_disparity, config, expected)
     flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
     d = mine[..., 0]
@@ -474,28 +483,12 @@ def _confirmed(d: Map, other: Map) -> NDArray[np.bool_]:
     return np.asarray((np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5))
 
 
-def polished(d: Map, left: Grey, right: Grey, span: tuple[float, float], config: DepthConfig) -> Map:
-    """Disparity (h, w) refined below the pixel by slanted windows; it moves by less than a pixel."""
-    scale = _Scale([left, right], RECTIFIED, NO_BACKS, 1.0)
-    start = np.stack([d, *_slopes(d), np.zeros_like(d)], -1)
-    fine = _refine(scale, start, d, (float(span[0]), float(span[1])), 0.5, config.rounds, config, config.prior_reach)[..., 0]
-    return np.where(np.abs(fine - d) < 1, fine, d).astype(np.float32)
-
-
-def _network_disparity(
-    greys: list[Grey], pair: Sequence[NDArray[np.uint8]], low: int, high: int, fill: bool, device: str, config: DepthConfig
-) -> tuple[Map, Map]:
+def _expected(pair: Sequence[NDArray[np.uint8]], low: int, high: int, device: str) -> _Expected:
+    """What the network finds in a pair."""
     from .network.match import shipped_matcher
 
     views = [np.repeat(i[..., None], 3, 2) if i.ndim == 2 else i for i in pair]
-    network = shipped_matcher(device)
-    d, confidence = network.disparity(views[0], views[1], high, low)
-    d = polished(d, greys[0], greys[1], (low, high), config)
-    if fill:
-        return d, confidence
-    other = network.disparity(views[1][:, ::-1], views[0][:, ::-1], high, low)[0][:, ::-1]
-    seen = _confirmed(d, other)
-    return np.where(seen, d, 0).astype(np.float32), np.where(seen, confidence, 0.01).astype(np.float32)
+    return _Expected(*shipped_matcher(device).disparity(views[0], views[1], high, low))
 
 
 def _grey(name: str, image: NDArray[np.uint8]) -> Grey:
@@ -510,10 +503,10 @@ RECTIFIED = np.array([[1, 0, 0, 0, 1, 0, 0, 0, 1, -1, 0, 0]], np.float32)
 """The relative map of a rectified pair: inverse depth is disparity."""
 
 
-def _rectified(left: Grey, right: Grey, low: int, high: int, config: DepthConfig) -> Map:
+def _rectified(left: Grey, right: Grey, low: int, high: int, config: DepthConfig, expected: _Expected | None = None) -> Map:
     # A pair's sweep runs at full size: its ranges are short and its details fine.
     scale = _Scale([left, right], RECTIFIED, NO_BACKS, 1.0)
-    return _sweep(scale, float(low), float(high), high - low + 1, config).planes
+    return _sweep(scale, float(low), float(high), high - low + 1, config, expected).planes
 
 
 def _fill_occlusions(d: Map, seen: NDArray[np.bool_], guide: Grey) -> Map:

@@ -6,8 +6,9 @@ use mvcore::correlate::{Features, Planes, Visibility};
 use mvcore::slanted::{Hypothesis, RefineParams, SourceSurface};
 use numpy::{
     PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArrayDyn,
-    PyUntypedArrayMethods,
+    PyReadwriteArray3, PyUntypedArrayMethods,
 };
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 #[pyfunction]
@@ -41,6 +42,22 @@ pub fn aggregate<'py>(
     let winners = run(py, || mvcore::aggregate::aggregate(values, planes, guide, penalties))?;
     let shape = [guide.height, guide.width];
     Ok((array(py, winners.plane, shape)?, array(py, winners.margin, shape)?))
+}
+
+/// Adds to `costs` (h, w, D) in place what planes far from the expected one cost more.
+#[pyfunction]
+pub fn expect<'py>(
+    py: Python<'py>,
+    mut costs: PyReadwriteArray3<'py, u8>,
+    expected: PyReadonlyArray2<'py, f32>,
+    confidence: PyReadonlyArray2<'py, f32>,
+    weight: f32,
+    reach: f32,
+) -> PyResult<()> {
+    let planes = costs.shape()[2];
+    let (expected, confidence) = (slice(&expected, "expected")?, slice(&confidence, "confidence")?);
+    let values = costs.as_slice_mut().map_err(|_| PyValueError::new_err("costs: expected a C-contiguous array"))?;
+    run(py, || mvcore::expect::expect(values, planes, expected, confidence, weight, reach))
 }
 
 /// (D, h, w, G) correlations; planes (D,) or (D, h, w).

@@ -12,6 +12,7 @@ pub mod consistency;
 pub mod correlate;
 pub mod cube;
 pub mod error;
+pub mod expect;
 pub mod files;
 pub mod fuse;
 pub mod grid;
