@@ -149,6 +149,20 @@ def test_network_helps_the_sweep_where_it_was_never_trained():
     assert np.mean(bad["dcnn"]) < 0.9 * np.mean(bad["sgm"])
 
 
+def test_network_sees_large_pairs_reduced_and_means_the_same_disparity(monkeypatch):
+    batch = make_batch(Recipe(seed=5, batch=1, pairs=1.0), 1)
+    pair = [np.ascontiguousarray(i[0].permute(1, 2, 0).numpy()) for i in batch.images]
+    most = int(np.ceil(float(batch.high[0])))
+    full = depth._expected(pair, 0, most, "cpu")
+    monkeypatch.setattr(depth, "PAIR_SIDE", 160)
+    reduced = depth._expected(pair, 0, most, "cpu")
+    assert reduced.inverse.shape == reduced.confidence.shape == full.inverse.shape
+    assert reduced.inverse.flags.c_contiguous
+    sure = (full.confidence > 0.9) & (reduced.confidence > 0.9)
+    assert sure.mean() > 0.1
+    assert np.median(np.abs(full.inverse - reduced.inverse)[sure]) < 0.5
+
+
 def test_expected_depth_is_a_bounded_term_of_the_costs():
     random = np.random.default_rng(0)
     costs = random.integers(0, 64, (5, 7, 20), np.uint8)

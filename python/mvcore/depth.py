@@ -468,7 +468,7 @@ def disparity(
     flipped = [np.ascontiguousarray(i[:, ::-1]) for i in (images[1], images[0])]
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
     d = mine[..., 0]
-    seen = _confirmed(d, theirs[:, ::-1, 0])
+    seen = _confirmed(d, theirs[:, ::-1, 0]) & ~_speckles(d)
     cost = mine[..., 3]
     confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
     if not fill:
@@ -483,12 +483,38 @@ def _confirmed(d: Map, other: Map) -> NDArray[np.bool_]:
     return np.asarray((np.abs(np.take_along_axis(other, near, 1) - d) <= 1.0) & (x >= -0.5))
 
 
+SPECKLE = 32
+"""Pixels of the largest patch that is taken for chance when its disparity stands off from all around it by more than one."""
+
+
+def _speckles(d: Map) -> NDArray[np.bool_]:
+    """Small patches on their own: both images may agree on them by chance."""
+    unit = min(16.0, 30000 / max(1.0, float(np.abs(d).max())))
+    fixed = np.rint(d * unit).astype(np.int16)
+    most = min(SPECKLE, d.size // 8)
+    marked, _ = cv2.filterSpeckles(fixed, -(1 << 15), most, round(unit))
+    return np.asarray(marked == -(1 << 15))
+
+
+PAIR_SIDE = 1024
+"""Pixels of the longer side at which the network sees a rectified pair: memory and time stay bounded, the sweep sees all of it."""
+
+
 def _expected(pair: Sequence[NDArray[np.uint8]], low: int, high: int, device: str) -> _Expected:
     """What the network finds in a pair."""
     from .network.match import shipped_matcher
 
+    h, w = pair[0].shape[:2]
+    share = min(1.0, PAIR_SIDE / max(h, w))
+    size = (max(2, round(w * share)), max(2, round(h * share)))
     views = [np.repeat(i[..., None], 3, 2) if i.ndim == 2 else i for i in pair]
-    return _Expected(*shipped_matcher(device).disparity(views[0], views[1], high, low))
+    if share < 1:
+        views = [cv2.resize(v, size, interpolation=cv2.INTER_AREA) for v in views]
+    ratio = size[0] / w
+    ends = int(np.ceil(high * ratio)), int(np.floor(low * ratio))
+    found, confidence = shipped_matcher(device).disparity(views[0], views[1], *ends)
+    inverse = _resized(found, (h, w)) / np.float32(ratio)
+    return _Expected(inverse, cv2.resize(confidence, (w, h), interpolation=cv2.INTER_LINEAR))
 
 
 def _grey(name: str, image: NDArray[np.uint8]) -> Grey:
