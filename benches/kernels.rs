@@ -131,6 +131,7 @@ const FUSION: FusionParams = FusionParams {
     solid_weight: 0.5,
     smoothing: 0.0,
     hull_tolerance: 0.05,
+    complete: false,
     max_memory: 4 << 30,
 };
 

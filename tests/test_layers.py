@@ -21,6 +21,7 @@ ORDER = [
     "depth",
     "volume",
     "carve",
+    "standing",
     "target",
     "surface",
     "texture",

@@ -8,9 +8,9 @@ import reference
 from conftest import look_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mvcore import _core, depth
+from mvcore import _core
 from mvcore.config import Config, DepthConfig, SurfaceConfig, VolumeConfig
-from mvcore.depth import View, estimate_depth, filter_depth, refine_depth, seeded_depth, sweep_depth
+from mvcore.depth import View, _speckles, estimate_depth, filter_depth, refine_depth, seeded_depth, sweep_depth
 from mvcore.errors import InvalidInputError, ReconstructionError
 from mvcore.io.images import read_image
 from mvcore.sparse import (
@@ -363,8 +363,8 @@ def test_chance_patches_of_a_disparity_map_are_told_from_thin_things():
     d = np.full((60, 80), 8.0, np.float32)
     d[10:13, 10:13] = 20
     d[5:55, 40] = 20
-    marked = depth._speckles(d)
+    marked = _speckles(d)
     assert marked[10:13, 10:13].all()
     assert marked.sum() == 9
-    assert not depth._speckles(np.linspace(0, 40, 60 * 80, dtype=np.float32).reshape(60, 80)).any()
-    assert not depth._speckles(np.full((4, 5), 1e5, np.float32)).any()
+    assert not _speckles(np.linspace(0, 40, 60 * 80, dtype=np.float32).reshape(60, 80)).any()
+    assert not _speckles(np.full((4, 5), 1e5, np.float32)).any()

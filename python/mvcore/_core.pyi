@@ -93,6 +93,7 @@ def fuse(
     solid_weight: float,
     smoothing: float,
     hull_tolerance: float,
+    complete: bool = ...,
     max_memory: int,
 ) -> tuple[_U32, _F32]: ...
 def carve(

@@ -114,6 +114,8 @@ class VolumeConfig:
     """Voxels: standard deviation of the field's smoothing without masks."""
     solid_smoothing: float = 2.0
     """With masks: where depth is known here and not there, the solid inside of the hull would leave crumbs."""
+    completed_share: float = 0.15
+    """`solid_share` where silhouettes were found because the depth maps show little: what few views measured there is doubtful."""
     hull_tolerance: float = 0.04
     """Share of the silhouettes that may disagree: one wrong mask among 25 does no harm; with fewer views each is needed."""
     max_memory: int = 4 << 30
@@ -160,6 +162,30 @@ class CarveConfig:
     """Views that must see a voxel before their colours may remove it."""
     rounds: int = 8
     """Most rounds of six sweeps; usually far fewer change anything."""
+
+
+@dataclass(frozen=True)
+class StandingConfig:
+    """Silhouettes of what stands on the ground, found without masks where the depth maps show little of it."""
+
+    enabled: bool = True
+    """Whether such silhouettes complete the surface."""
+    max_measured: float = 0.5
+    """Share of the silhouettes' pixels with a filtered depth above which the depth maps do without: hulls fill hollows."""
+    min_agreement: float = 0.88
+    """Intersection over union of a silhouette and the common hull's, in the median view: less is no outline of one thing."""
+    max_gap: float = 90.0
+    """Degrees between neighbouring cameras around it: beyond, the hull is more corner than target."""
+    ground_share: float = 0.3
+    """Least share of the measured points that lie on the ground, less twice those under it."""
+    ground_tolerance: float = 0.01
+    """Share of the box's longest side within which a point counts as on the ground; targets begin at twice that."""
+    step: int = 4
+    """Pixels between the points that the ground is sought in."""
+    look_size: int = 160
+    """Pixels of the longer side for the quick look that tells how much was measured."""
+    max_size: int = 480
+    """Pixels of the longer side at which silhouettes are found."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +257,7 @@ class Config:
     volume: VolumeConfig = field(default_factory=VolumeConfig)
     target: TargetConfig = field(default_factory=TargetConfig)
     carve: CarveConfig = field(default_factory=CarveConfig)
+    standing: StandingConfig = field(default_factory=StandingConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     texture: TextureConfig = field(default_factory=TextureConfig)
     video: VideoConfig = field(default_factory=VideoConfig)

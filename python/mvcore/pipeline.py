@@ -25,7 +25,8 @@ from .errors import ReconstructionError, require
 from .io import load
 from .io.images import find_masks, load_frame, load_mask, reduce, undistort
 from .result import Reconstruction
-from .surface import Surface, cleaned, isosurface
+from .standing import find_standing
+from .surface import Surface, cleaned, drop_cavities, isosurface
 from .texture import Given, texture
 from .types import Bounds, DepthMap, Frame, Image, Report, SparsePoints, Track, no_track
 from .volume import Volume, Window, fuse_tiles
@@ -202,13 +203,27 @@ def build(
         filtered = filter_views(views, plan, depths, config.depth, track)
         fused = filter_views(views, plan, depths, config.depth.loosened(), track)
         _say_kept(filtered, plan.sources, views.masks is not None, report)
+    found = None
+    if views.masks is None and config.standing.enabled:
+        with clock.stage("silhouettes"):
+            found = find_standing(views.images, views.cameras, fused, plan.box, config.standing, config.carve, report)
+        if found is not None:
+            fused = found.agreeing(fused, views.cameras)
     with clock.stage("volume"):
-        found = isosurface(fuse_views(views, plan, fused, config, report))
-    return finish(views, plan, filtered, found, config, report, track, clock, given)
+        surface = isosurface(fuse_views(views, plan, fused, config, report, found and found.silhouettes))
+        if found is not None:
+            surface = drop_cavities(surface)
+            _say_completed(report)
+    return finish(views, plan, filtered, surface, config, report, track, clock, given)
 
 
-def fuse_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: Config, report: Report) -> Iterator[Volume]:
-    """The signed distance field of filtered depth maps, in parts; of the visual hull where no view has sources but masks are given."""
+def fuse_views(
+    views: Views, plan: Plan, depths: list[DepthMap | None], config: Config, report: Report, found: Masks | None = None
+) -> Iterator[Volume]:
+    """The signed distance field of filtered depth maps, in parts; of the visual hull where no view has sources but masks are given.
+
+    ``found`` are silhouettes that complete it where there are no masks.
+    """
     if any(plan.sources) or views.masks is None:
         maps, settings = [d if d is not None else _nothing(c) for d, c in zip(depths, views.cameras, strict=True)], config.volume
     elif config.carve.photo_consistency:
@@ -217,7 +232,7 @@ def fuse_views(views: Views, plan: Plan, depths: list[DepthMap | None], config: 
         return
     else:
         maps, settings = hull_alone(views.cameras, config.volume)
-    yield from fuse_tiles(maps, views.cameras, plan.box, views.masks, settings, report, views.windows)
+    yield from fuse_tiles(maps, views.cameras, plan.box, views.masks, settings, report, views.windows, found)
 
 
 def finish(
@@ -327,6 +342,14 @@ def _say_kept(filtered: list[DepthMap | None], sources: list[list[int]], masked:
     poor = [n for n, s in enumerate(shares) if s is not None and s < 0.01]
     if poor and not masked:
         report.warn(f"views {poor} contribute almost nothing: less than 1 % of their depth agrees with other views")
+
+
+def _say_completed(report: Report) -> None:
+    share = report.values["standing"]["measured"]
+    report.warn(
+        f"the depth maps show only {share:.0%} of what stands in the middle: its outlines in the photographs complete it, "
+        "and hollows that no outline shows are filled"
+    )
 
 
 def _peak_memory() -> int:

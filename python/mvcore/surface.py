@@ -136,8 +136,21 @@ def drop_cavities(surface: Surface) -> Surface:
     """Drops closed parts that face inward (their signed volume is negative): no photograph sees into a bubble."""
     part = _core.components(surface.faces)
     a, b, c = (surface.vertices[surface.faces[:, k]] - surface.vertices.mean(0) for k in range(3))
-    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)))
-    return compact(surface.vertices, surface.faces[volume[part] > 0])
+    inward = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c))) <= 0
+    some = np.nonzero(inward[part])[0]
+    # An open part has no inside.
+    inward[part[some[_at_border(surface.faces[some])]]] = False
+    return compact(surface.vertices, surface.faces[~inward[part]])
+
+
+def _at_border(faces: Faces) -> NDArray[np.bool_]:
+    """Faces with an edge that no other face has, (f,) bool."""
+    wide = faces.astype(np.int64)
+    ends = np.sort(np.stack([wide, np.roll(wide, -1, 1)], -1).reshape(-1, 2), 1)
+    _, first, count = np.unique(ends[:, 0] << 32 | ends[:, 1], return_index=True, return_counts=True)
+    border = np.zeros(len(faces), bool)
+    border[first[count == 1] // 3] = True
+    return border
 
 
 def smooth(surface: Surface, rounds: int) -> Surface:

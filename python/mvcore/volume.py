@@ -132,6 +132,7 @@ class _Fusion:
     weights: list[NDArray[np.float32]]
     silhouettes: list[NDArray[np.float32]] | None
     windows: list[Window]
+    complete: bool
     projections: NDArray[np.float64]
     bounds: Bounds
     config: VolumeConfig
@@ -146,13 +147,16 @@ class _Fusion:
         masks: Sequence[NDArray[np.uint8]] | None,
         config: VolumeConfig,
         windows: Sequence[Window] | None,
+        found: Sequence[NDArray[np.uint8]] | None,
     ) -> _Fusion:
         bounds = np.asarray(bounds, np.float64)
+        outlines = found if masks is None else repaired_masks(depths, cameras, masks)
         return cls(
             [d.depth for d in depths],
             [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
-            None if masks is None else [silhouette_distance(m) for m in repaired_masks(depths, cameras, masks)],
+            None if outlines is None else [silhouette_distance(m) for m in outlines],
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
+            masks is None and found is not None,
             np.stack([c.projection for c in cameras]),
             bounds,
             config,
@@ -181,9 +185,10 @@ class _Fusion:
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
-            solid_weight=config.solid_share * len(self.depths),
-            smoothing=config.smoothing if self.silhouettes is None else config.solid_smoothing,
+            solid_weight=(config.completed_share if self.complete else config.solid_share) * len(self.depths),
+            smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
             hull_tolerance=config.hull_tolerance,
+            complete=self.complete,
             max_memory=config.max_memory,
         )
         return replace(grid, coords=coords, values=values)
@@ -236,7 +241,7 @@ def fuse(
         Nothing lies inside the bounds.
     """
     config, report = config or VolumeConfig(), report or Report()
-    job = _Fusion.of(depths, cameras, bounds, masks, config, windows)
+    job = _Fusion.of(depths, cameras, bounds, masks, config, windows, None)
     voxel = job.voxel
     while True:
         try:
@@ -258,14 +263,18 @@ def fuse_tiles(
     config: VolumeConfig | None = None,
     report: Report | None = None,
     windows: Sequence[Window] | None = None,
+    found: Sequence[NDArray[np.uint8]] | None = None,
 ) -> Iterator[Volume]:
     """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out.
 
     Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone: `mvcore.surface.isosurface`
-    joins their surfaces to that of the whole. Parameters and errors as of `fuse`.
+    joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
+
+    found : silhouettes that were found in the photographs, instead of masks: their hull stands in where no depth map reaches, and cuts
+        nothing.
     """
     config, report = config or VolumeConfig(), report or Report()
-    job = _Fusion.of(depths, cameras, bounds, masks, config, windows)
+    job = _Fusion.of(depths, cameras, bounds, masks, config, windows, found)
     grid = job.grid(job.voxel)
 
     def told() -> Iterator[Volume]:

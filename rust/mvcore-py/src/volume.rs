@@ -38,7 +38,7 @@ pub fn consistency<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, complete = false, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -56,6 +56,7 @@ pub fn fuse<'py>(
     solid_weight: f32,
     smoothing: f32,
     hull_tolerance: f32,
+    complete: bool,
     max_memory: usize,
 ) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray4<f32>>)> {
     let (depths, weights) = (rasters(&depths, "depths")?, rasters(&weights, "weights")?);
@@ -76,8 +77,16 @@ pub fn fuse<'py>(
             focal: (p[v][0].powi(2) + p[v][1].powi(2) + p[v][2].powi(2)).sqrt().max(1e-9),
         })
         .collect();
-    let params =
-        FusionParams { truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, max_memory };
+    let params = FusionParams {
+        truncation,
+        free_weight,
+        min_weight,
+        solid_weight,
+        smoothing,
+        hull_tolerance,
+        complete,
+        max_memory,
+    };
     let volume = run(py, || {
         let grid = Grid::new(origin, voxel, shape)?;
         let tile = tile.map_or(Tile::whole(&grid), |[low, high]| Tile { low, high });

@@ -5,13 +5,13 @@
 //! ```
 //!
 //! Voxels farther than τ in front of a surface get +τ from that view: free space carves what other views put there by mistake.
-//! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid. Curless and
-//! Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
+//! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid; or they only
+//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Curless and Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
 //! order: the same bytes for any thread count.
 
 use crate::error::{Error, Result, require};
 use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
-use crate::hull::{SoftSilhouette, cut_block, restrict_to_hull};
+use crate::hull::{SoftSilhouette, cut_block, mark_hull, restrict_to_hull};
 use crate::memory::zeroed;
 use crate::raster::Raster;
 use crate::smooth::smooth;
@@ -59,6 +59,8 @@ pub struct FusionParams {
     pub solid_weight: f32,
     /// Share of the silhouettes that see a voxel and may disagree with its being inside.
     pub hull_tolerance: f32,
+    /// Silhouettes complete what the depth maps leave open; they cut nothing.
+    pub complete: bool,
     /// Most bytes of the volume.
     pub max_memory: usize,
 }
@@ -106,9 +108,15 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
         mark_surface(&grid, &tile, view, params.truncation, &flags);
     }
     let silhouettes: Vec<SoftSilhouette> = views.iter().filter_map(FusionView::soft_silhouette).collect();
-    let masked = !silhouettes.is_empty();
-    if masked {
-        restrict_to_hull(&grid, &tile, &silhouettes, params.hull_tolerance, &flags);
+    let hull = match (silhouettes.is_empty(), params.complete) {
+        (true, _) => Hull::Unknown,
+        (false, false) => Hull::Cuts,
+        (false, true) => Hull::Completes,
+    };
+    match hull {
+        Hull::Unknown => {}
+        Hull::Cuts => restrict_to_hull(&grid, &tile, &silhouettes, params.hull_tolerance, &flags),
+        Hull::Completes => mark_hull(&grid, &tile, &silhouettes, params.hull_tolerance, params.truncation, &flags),
     }
     let map = BlockMap::from_flags(tile, flags.iter().map(|f| f.load(Ordering::Relaxed)));
     let needed = map.coords.len() * BLOCK * VOXEL_BYTES + table;
@@ -118,16 +126,37 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
     let mut values = zeroed::<f32>(map.coords.len() * BLOCK);
     let tiles: Vec<Tiles> = views.par_iter().map(|v| Tiles::of(v.depth)).collect();
     values.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).for_each(|(out, at)| {
-        integrate(&grid, *at, views, &tiles, params, masked, out);
-        if masked {
+        let cut = |out: &mut [f32]| {
             cut_block(&grid, *at, &silhouettes, params.hull_tolerance, params.truncation, out);
+        };
+        match hull {
+            Hull::Unknown => integrate(&grid, *at, views, &tiles, params, &[f32::NAN; BLOCK], out),
+            Hull::Cuts => {
+                integrate(&grid, *at, views, &tiles, params, &[-1.0; BLOCK], out);
+                cut(out);
+            }
+            Hull::Completes => {
+                let mut distance = [-1.0; BLOCK];
+                cut(&mut distance);
+                // Farther outside than τ nothing is known of a voxel that no depth map reaches.
+                let open = distance.map(|d| if d < 1.0 { d } else { f32::NAN });
+                integrate(&grid, *at, views, &tiles, params, &open, out);
+            }
         }
     });
     if params.smoothing > 0.0 {
         // With silhouettes what no block covers is outside the hull.
-        values = smooth(&values, &map, params.smoothing, masked.then_some(1.0));
+        values = smooth(&values, &map, params.smoothing, (hull == Hull::Cuts).then_some(1.0));
     }
     Ok(Volume { map, values })
+}
+
+/// What the visual hull does to the field.
+#[derive(Clone, Copy, PartialEq)]
+enum Hull {
+    Unknown,
+    Cuts,
+    Completes,
 }
 
 /// Marks the blocks within τ of a view's surface, walking each pixel's ray.
@@ -270,7 +299,7 @@ fn integrate(
     views: &[FusionView],
     tiles: &[Tiles],
     params: &FusionParams,
-    masked: bool,
+    otherwise: &[f32; BLOCK],
     out: &mut [f32],
 ) {
     let inverse_truncation = (1.0 / params.truncation) as f32;
@@ -289,19 +318,13 @@ fn integrate(
             add_row(view, &stepper, i, j, inverse_truncation, params.free_weight, sum, total, near);
         }
     }
-    // With silhouettes the inside of the hull is solid until enough observations, of surface or of free space, overrule it.
-    let (least_near, least_free) =
-        if masked { (params.solid_weight, params.solid_weight) } else { (params.min_weight, 0.0) };
+    // The inside of the hull is solid until enough observations, of surface or of free space, overrule it.
     for n in 0..BLOCK {
+        let (least_near, least_free) =
+            if otherwise[n] < 0.0 { (params.solid_weight, params.solid_weight) } else { (params.min_weight, 0.0) };
         let mean = sum[n] / total[n].max(1e-12);
         let known = total[n] > 0.0 && (near[n] >= least_near || (mean >= 0.0 && total[n] > least_free));
-        out[n] = if known {
-            mean
-        } else if masked {
-            -1.0
-        } else {
-            f32::NAN
-        };
+        out[n] = if known { mean } else { otherwise[n] };
     }
 }
 
@@ -390,6 +413,7 @@ mod tests {
         solid_weight: 0.5,
         smoothing: 0.0,
         hull_tolerance: 0.0,
+        complete: false,
         max_memory: 1 << 30,
     };
 
@@ -441,6 +465,37 @@ mod tests {
         };
         assert!(value(20, 20, 20) < -0.9);
         assert!(value(20, 29, 20) > 0.0); // 0.45 to the side: 6.75 px
+    }
+
+    #[test]
+    fn a_hull_that_completes_stands_in_where_nothing_was_seen() {
+        // The left half of a plane at z = 0 is seen; the silhouette is a disc.
+        let depth: Vec<f32> = (0..64 * 64).map(|i| if i % 64 < 32 { 4.0 } else { 0.0 }).collect();
+        let weight = vec![1.0f32; 64 * 64];
+        let outside: Vec<f32> =
+            (0..64 * 64).map(|i| (((i % 64) as f32 - 31.5).hypot((i / 64) as f32 - 31.5)) - 6.0).collect();
+        let params = FusionParams { complete: true, ..PARAMS };
+        let alone = fuse(grid(), &[view(&depth, &weight, None)], &PARAMS).unwrap();
+        let volume = fuse(grid(), &[view(&depth, &weight, Some(&outside))], &params).unwrap();
+        let value = |volume: &Volume, i: usize, j: usize, k: usize| {
+            let slot = volume.map.at(i / 8, j / 8, k / 8);
+            if slot == u32::MAX {
+                return f32::NAN;
+            }
+            volume.values[slot as usize * BLOCK + (i % 8) * 64 + (j % 8) * 8 + k % 8]
+        };
+        // Unseen: solid within the disc, open just beside it, unknown far off.
+        assert!(value(&alone, 22, 20, 20).is_nan());
+        assert!(value(&volume, 22, 20, 20) < -0.9);
+        assert!(value(&volume, 29, 20, 20) > 0.0);
+        assert!(value(&volume, 38, 20, 20).is_nan());
+        // Seen: the plane stays where the disc is not.
+        for k in 14..24 {
+            let (a, b) = (value(&alone, 4, 20, k), value(&volume, 4, 20, k));
+            assert!(a == b || (a.is_nan() && b.is_nan()), "{k}: {a} {b}");
+        }
+        // In front of the plane the silhouette does not make it solid, as that was seen to be free.
+        assert!(value(&volume, 16, 20, 14) > 0.9);
     }
 
     #[test]

@@ -28,6 +28,29 @@ pub struct SoftSilhouette<'a> {
 
 /// Unmarks blocks outside the hull and marks all those inside it; `tolerance` is the share of the silhouettes that may disagree.
 pub fn restrict_to_hull(grid: &Grid, tile: &Tile, views: &[SoftSilhouette], tolerance: f32, flags: &[AtomicBool]) {
+    for_each_block(grid, tile, views, tolerance, flags, |away, radius, flag| {
+        flag.store(away < radius, Ordering::Relaxed);
+    });
+}
+
+/// Marks the blocks inside the hull and those less than `reach` in world units outside it, and unmarks none.
+pub fn mark_hull(grid: &Grid, tile: &Tile, views: &[SoftSilhouette], tolerance: f32, reach: f64, flags: &[AtomicBool]) {
+    for_each_block(grid, tile, views, tolerance, flags, |away, radius, flag| {
+        if away < radius + reach as f32 {
+            flag.store(true, Ordering::Relaxed);
+        }
+    });
+}
+
+/// Tells of each block its middle's distance from the hull, and the distance at which none of it lies on the hull.
+fn for_each_block(
+    grid: &Grid,
+    tile: &Tile,
+    views: &[SoftSilhouette],
+    tolerance: f32,
+    flags: &[AtomicBool],
+    tell: impl Fn(f32, f32, &AtomicBool) + Sync,
+) {
     let half = 0.5 * SIDE as f64;
     let radius = (half * grid.voxel * 3f64.sqrt()) as f32;
     flags.par_iter().enumerate().for_each_init(
@@ -38,8 +61,7 @@ pub fn restrict_to_hull(grid: &Grid, tile: &Tile, views: &[SoftSilhouette], tole
             outside.clear();
             outside.extend(views.iter().filter_map(|v| distance(v, p)));
             let vote = Vote { silhouettes: views.len(), seen: outside.len(), above: 0 };
-            // A block on the border of the hull lies within its radius of it.
-            flag.store(vote.distance(outside, tolerance) < radius * 1.2, Ordering::Relaxed);
+            tell(vote.distance(outside, tolerance), radius * 1.2, flag);
         },
     );
 }

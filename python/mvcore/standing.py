@@ -1,0 +1,249 @@
+"""Silhouettes of what stands on the ground amid the cameras, found in photographs without masks.
+
+Where a target has hardly any texture, depth maps measure little of it, but its outline is plain in every photograph. Colours of what
+was measured above the ground and colours of the ground tell the rest (GrabCut, one pair of mixtures for all views). Trusted only if the
+cameras stand all around, and if the silhouettes agree with each other. After Campbell et al., BMVC 2007.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .cameras import Camera
+from .carve import carve_silhouettes, shadow, target_hull
+from .config import CarveConfig, StandingConfig
+from .io.images import reduce
+from .types import Bounds, DepthMap, Image, Report
+
+Mask = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The ground: normal (3,) towards the cameras, ``height`` of a point p above it is normal · p - offset."""
+
+    normal: NDArray[np.float64]
+    offset: float
+
+    def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of points (n, 3), world units."""
+        return np.asarray(points @ self.normal - self.offset)
+
+
+HYPOTHESES = 1000
+"""Planes through three random points: with a third of the points on the ground 1000 find it but once in 10^16."""
+
+
+def ground(points: NDArray[np.float64], cameras: Sequence[Camera], tolerance: float, share: float) -> Plane | None:
+    """The plane that at least ``share`` of the points (n, 3) lie on and next to none under, all cameras above; None without."""
+    if len(points) < 3:
+        return None
+    random = np.random.default_rng(0)
+    centers = np.stack([c.center for c in cameras])
+    some = points[random.permutation(len(points))[:5000]]
+    a, b, c = (some[i] for i in random.integers(len(some), size=(3, HYPOTHESES)))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    a, normals = a[lengths > 0], normals[lengths > 0] / lengths[lengths > 0, None]
+    normals *= np.sign(normals @ centers.mean(0) - (normals * a).sum(1))[:, None]
+    offsets = (normals * a).sum(1)
+    heights = some @ normals.T - offsets
+    score = (np.abs(heights) < tolerance).mean(0) - 2 * (heights < -3 * tolerance).mean(0)
+    score[(centers @ normals.T < offsets).any(0)] = -np.inf
+    best = int(score.argmax()) if len(score) else 0
+    if not len(score) or score[best] < share:
+        return None
+    near = points[np.abs(points @ normals[best] - offsets[best]) < tolerance]
+    middle = near.mean(0)
+    normal = np.linalg.svd((near - middle)[:20000], full_matrices=False)[2][2]
+    normal *= np.sign(normal @ normals[best])
+    return Plane(normal, float(normal @ middle))
+
+
+def widest_gap(cameras: Sequence[Camera], middle: NDArray[np.float64], plane: Plane) -> float:
+    """Degrees of the widest gap between neighbouring cameras as seen from above the ground."""
+    away = np.stack([c.center for c in cameras]) - middle
+    across = np.linalg.svd(plane.normal[None])[2][1:]
+    angles = np.sort(np.degrees(np.arctan2(*(away @ across.T).T)))
+    return float(np.diff(angles, append=angles[0] + 360).max())
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What stands on the ground inside a box.
+
+    silhouettes : (h, w) uint8 of 0 and 255, one a camera. plane : the ground. tolerance : world units within which a point is on it.
+    """
+
+    silhouettes: list[Mask]
+    plane: Plane
+    bounds: Bounds
+    tolerance: float
+
+    def kinds(self, points: NDArray[np.float64]) -> tuple[Bool, Bool]:
+        """Of points (n, 3): which surely stand, which surely do not."""
+        return _kinds(points, self.plane, self.bounds, self.tolerance)
+
+    def agreeing(self, depths: Sequence[DepthMap | None], cameras: Sequence[Camera]) -> list[DepthMap | None]:
+        """Depth maps without what the silhouettes contradict: standing points beside them, background within."""
+        return [self._kept(*v) for v in zip(depths, cameras, self.silhouettes, strict=True)]
+
+    def _kept(self, view: DepthMap | None, camera: Camera, mask: Mask) -> DepthMap | None:
+        if view is None:
+            return None
+        pixels, points = _points(view, camera, 1)
+        stands, lies = self.kinds(points)
+        within = mask[pixels[:, 1], pixels[:, 0]] > 0
+        wrong = pixels[np.where(within, lies, stands)]
+        depth = view.depth.copy()
+        depth[wrong[:, 1], wrong[:, 0]] = 0
+        return DepthMap(depth, view.confidence)
+
+
+def _kinds(points: NDArray[np.float64], plane: Plane, bounds: Bounds, tolerance: float) -> tuple[Bool, Bool]:
+    height = plane.height(points)
+    inside = ((points > bounds[0]) & (points < bounds[1])).all(1)
+    return inside & (height > 2 * tolerance), ~inside | (height < tolerance)
+
+
+def find_standing(
+    images: Sequence[Image],
+    cameras: Sequence[Camera],
+    depths: Sequence[DepthMap | None],
+    bounds: Bounds,
+    config: StandingConfig | None = None,
+    carving: CarveConfig | None = None,
+    report: Report | None = None,
+) -> Standing | None:
+    """Silhouettes of what stands on the ground inside ``bounds``, where depth maps leave most of it open.
+
+    Parameters
+    ----------
+    images : undistorted (h, w, 3) uint8, one a camera. depths : filtered, one a camera or None. bounds : (2, 3) world.
+
+    Returns
+    -------
+    None where there is no ground, the cameras do not stand all around, the silhouettes do not
+    agree, or the depth maps do without. ``report.values["standing"]`` says which.
+    """
+    config, carving, report = config or StandingConfig(), carving or CarveConfig(), report or Report()
+    said = report.values["standing"] = {"silhouettes": False}
+    size = float((bounds[1] - bounds[0]).max())
+    tolerance = config.ground_tolerance * size
+    measured = [_points(d, c, config.step) for d, c in zip(depths, cameras, strict=True)]
+    near = [p[((p > bounds[0] - 0.5 * size) & (p < bounds[1] + 0.5 * size)).all(1)] for _, p in measured]
+    plane = ground(np.concatenate(near), cameras, tolerance, config.ground_share)
+    if plane is None:
+        said["why"] = "no ground"
+        return None
+    said["widest_gap"] = round(widest_gap(cameras, bounds.mean(0), plane), 1)
+    if said["widest_gap"] > config.max_gap:
+        said["why"] = "the cameras do not stand all around"
+        return None
+    for side in (config.look_size, config.max_size):
+        views = [_seeds(*v, plane, bounds, tolerance, side) for v in zip(images, cameras, depths, strict=True)]
+        masks = _cut(views)
+        if not all(m.any() for m in masks):
+            said["why"] = "some view shows nothing that stands"
+            return None
+        # The smaller size is a quick look.
+        said["measured"] = round(float(np.mean([v.known[m > 0].mean() for v, m in zip(views, masks, strict=True)])), 3)
+        if said["measured"] > config.max_measured:
+            said["why"] = "the depth maps show most of it"
+            return None
+    said["agreement"] = round(_agreement(masks, [v.camera for v in views], bounds, carving), 3)
+    if said["agreement"] < config.min_agreement:
+        said["why"] = "the silhouettes disagree"
+        return None
+    said["silhouettes"] = True
+    return Standing([_enlarged(m, c) for m, c in zip(masks, cameras, strict=True)], plane, bounds, tolerance)
+
+
+def _points(view: DepthMap | None, camera: Camera, step: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Pixels (n, 2) that have a depth, every ``step``-th, and their points (n, 3) in the world."""
+    if view is None:
+        return np.zeros((0, 2), np.int64), np.zeros((0, 3))
+    y, x = np.nonzero(view.depth[::step, ::step])
+    pixels = np.column_stack([x, y]) * step
+    return pixels, camera.unproject(pixels, view.depth[pixels[:, 1], pixels[:, 0]])
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """A reduced view: what surely stands, what surely does not, and where depth is known at all."""
+
+    image: Image
+    camera: Camera
+    target: Bool
+    background: Bool
+    known: Bool
+
+
+def _seeds(image: Image, camera: Camera, depth: DepthMap | None, plane: Plane, bounds: Bounds, tolerance: float, side: int) -> _Seeds:
+    small, reduced = reduce(image, camera, side)
+    pixels, points = _points(depth, camera, 1)
+    kinds = (*_kinds(points, plane, bounds, tolerance), np.ones(len(points), bool))
+
+    def shown(kind: Bool) -> Bool:
+        full = np.zeros(image.shape[:2], np.uint8)
+        full[pixels[kind, 1], pixels[kind, 0]] = 255
+        return np.asarray(cv2.resize(full, (reduced.width, reduced.height), interpolation=cv2.INTER_AREA) > 127)
+
+    target, background, known = map(shown, kinds)
+    kernel = np.ones((3, 3), np.uint8)
+    sure = [cv2.erode(m.astype(np.uint8), kernel) > 0 for m in (target, background)]
+    return _Seeds(small, reduced, sure[0], sure[1], known)
+
+
+def _cut(views: Sequence[_Seeds]) -> list[Mask]:
+    """GrabCut over all views as one picture, so that they share their colours; parts of some size only. 0 and 1."""
+    width = max(v.image.shape[1] for v in views)
+    pictures, labels = [], []
+    for v in views:
+        label = np.where(v.target, cv2.GC_FGD, np.where(v.background, cv2.GC_BGD, cv2.GC_PR_BGD)).astype(np.uint8)
+        beside = width - label.shape[1]
+        # A row between the pictures belongs to none.
+        labels.append(np.pad(label, ((0, 1), (0, beside)), constant_values=cv2.GC_BGD))
+        pictures.append(np.pad(v.image, ((0, 1), (0, beside), (0, 0)), mode="edge"))
+    label = np.concatenate(labels)
+    if not (label & 1).any():
+        return [np.zeros(v.image.shape[:2], np.uint8) for v in views]
+    cv2.setRNGSeed(0)  # its k-means: the same masks each time
+    cv2.grabCut(np.concatenate(pictures), label, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
+    ends = np.cumsum([len(part) for part in labels])[:-1]
+    cut = [np.ascontiguousarray(part[:-1, : v.image.shape[1]] & 1) for part, v in zip(np.split(label, ends), views, strict=True)]
+    return [_large(c) for c in cut]
+
+
+LEAST_PART = 0.05
+"""Share of the largest part's pixels below which a part is dropped."""
+
+
+def _large(mask: Mask) -> Mask:
+    count, part, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    return (area >= max(1, LEAST_PART * area.max()))[part].astype(np.uint8) if count > 1 else mask
+
+
+def _agreement(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> float:
+    """Median over the views of intersection over union of a mask and what their common hull shows there."""
+    around = target_hull(masks, cameras, bounds, config)
+    full = np.argwhere(around.occupied)
+    if not len(full):
+        return 0.0
+    box = around.origin + around.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
+    hull = carve_silhouettes(masks, cameras, box, tolerance=0.5 * config.tolerance)
+    shown = [shadow(hull, c) > 0 for c in cameras]
+    return float(np.median([(s & (m > 0)).sum() / (s | (m > 0)).sum() for s, m in zip(shown, masks, strict=True)]))
+
+
+def _enlarged(mask: Mask, camera: Camera) -> Mask:
+    smooth = cv2.resize(mask * np.uint8(255), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    return np.where(cv2.GaussianBlur(smooth, (0, 0), 1.0) > 127, 255, 0).astype(np.uint8)
