@@ -146,9 +146,10 @@ def find_standing(
     if said["widest_gap"] > config.max_gap:
         said["why"] = "the cameras do not stand all around"
         return None
+    masks: list[Mask] = []
     for side in (config.look_size, config.max_size):
         views = [_seeds(*v, plane, bounds, tolerance, side) for v in zip(images, cameras, depths, strict=True)]
-        masks = _cut(views)
+        masks = _cut(views, masks)
         if not all(m.any() for m in masks):
             said["why"] = "some view shows nothing that stands"
             return None
@@ -201,24 +202,46 @@ def _seeds(image: Image, camera: Camera, depth: DepthMap | None, plane: Plane, b
     return _Seeds(small, reduced, sure[0], sure[1], known)
 
 
-def _cut(views: Sequence[_Seeds]) -> list[Mask]:
-    """GrabCut over all views as one picture, so that they share their colours; parts of some size only. 0 and 1."""
-    width = max(v.image.shape[1] for v in views)
+def _cut(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
+    """GrabCut over all views as one picture, so that they share their colours; parts of some size only. 0 and 1.
+
+    ``looks`` are masks of smaller images, if any: only what is around them is cut.
+    """
+    shapes = [v.image.shape[:2] for v in views]
+    windows = [_around(*v) for v in zip(looks, shapes, strict=True)] if looks else [np.s_[0:h, 0:w] for h, w in shapes]
+    width = max(x.stop - x.start for _, x in windows)
     pictures, labels = [], []
-    for v in views:
-        label = np.where(v.target, cv2.GC_FGD, np.where(v.background, cv2.GC_BGD, cv2.GC_PR_BGD)).astype(np.uint8)
-        beside = width - label.shape[1]
-        # A row between the pictures belongs to none.
-        labels.append(np.pad(label, ((0, 1), (0, beside)), constant_values=cv2.GC_BGD))
-        pictures.append(np.pad(v.image, ((0, 1), (0, beside), (0, 0)), mode="edge"))
+    for v, w in zip(views, windows, strict=True):
+        label = np.where(v.target, cv2.GC_FGD, np.where(v.background, cv2.GC_BGD, cv2.GC_PR_BGD)).astype(np.uint8)[w]
+        # A row and a column between the pictures belong to none.
+        fill = ((0, 1), (0, width + 1 - label.shape[1]))
+        labels.append(np.pad(label, fill, constant_values=cv2.GC_BGD))
+        pictures.append(np.pad(v.image[w], (*fill, (0, 0)), mode="edge"))
     label = np.concatenate(labels)
-    if not (label & 1).any():
-        return [np.zeros(v.image.shape[:2], np.uint8) for v in views]
+    masks = [np.zeros(v.image.shape[:2], np.uint8) for v in views]
+    if not (label & 1).any() or (label & 1).all():
+        return masks
     cv2.setRNGSeed(0)  # its k-means: the same masks each time
     cv2.grabCut(np.concatenate(pictures), label, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
-    ends = np.cumsum([len(part) for part in labels])[:-1]
-    cut = [np.ascontiguousarray(part[:-1, : v.image.shape[1]] & 1) for part, v in zip(np.split(label, ends), views, strict=True)]
-    return [_large(c) for c in cut]
+    for mask, window, part in zip(masks, windows, np.split(label, np.cumsum([len(part) for part in labels])[:-1]), strict=True):
+        inside = mask[window]
+        inside[:] = part[:-1, : inside.shape[1]] & 1
+    return [_large(m) for m in masks]
+
+
+MARGIN = 0.15
+"""Share of a target's size that is looked at around it; background there is what its colours must be told from."""
+
+
+def _around(look: Mask, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of an image of ``shape`` around what a smaller mask shows."""
+    ends = []
+    for axis in (0, 1):
+        found = np.nonzero(look.any(1 - axis))[0]
+        margin = 2 + MARGIN * (found[-1] - found[0])
+        ratio = shape[axis] / look.shape[axis]
+        ends.append(slice(max(0, int((found[0] - margin) * ratio)), min(shape[axis], int((found[-1] + 1 + margin) * ratio))))
+    return ends[0], ends[1]
 
 
 LEAST_PART = 0.05
