@@ -6,7 +6,7 @@ import mvcore
 import numpy as np
 import pytest
 from conftest import look_at, texture_of
-from mvcore import _core
+from mvcore import _core, standing
 from mvcore.cameras import Camera
 from mvcore.config import Config, StandingConfig, VolumeConfig
 from mvcore.standing import Plane, find_standing, ground, widest_gap
@@ -82,6 +82,14 @@ def test_silhouettes_are_found_where_the_depth_maps_leave_the_target_open(stand)
         assert ((s > 0) & m).sum() / ((s > 0) | m).sum() > 0.93
     again = find_standing(images, cameras, maps, BOUNDS)
     assert all((a == b).all() for a, b in zip(found.silhouettes, again.silhouettes))
+
+
+def test_many_views_are_cut_in_groups_with_like_results(stand, monkeypatch):
+    cameras, images, maps, masks = stand
+    monkeypatch.setattr(standing, "GROUP", 5)
+    found = find_standing(images, cameras, maps, BOUNDS)
+    for s, m in zip(found.silhouettes, masks):
+        assert ((s > 0) & m).sum() / ((s > 0) | m).sum() > 0.93
 
 
 def test_silhouettes_are_not_trusted_without_reason(stand):

@@ -149,7 +149,7 @@ def find_standing(
     masks: list[Mask] = []
     for side in (config.look_size, config.max_size):
         views = [_seeds(*v, plane, bounds, tolerance, side) for v in zip(images, cameras, depths, strict=True)]
-        masks = _cut(views, masks)
+        masks = _cut_in_groups(views, masks)
         if not all(m.any() for m in masks):
             said["why"] = "some view shows nothing that stands"
             return None
@@ -200,6 +200,19 @@ def _seeds(image: Image, camera: Camera, depth: DepthMap | None, plane: Plane, b
     kernel = np.ones((3, 3), np.uint8)
     sure = [cv2.erode(m.astype(np.uint8), kernel) > 0 for m in (target, background)]
     return _Seeds(small, reduced, sure[0], sure[1], known)
+
+
+GROUP = 16
+"""Views that are cut together: enough to know the colours, few enough for memory."""
+
+
+def _cut_in_groups(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
+    """`_cut` of views spread over the rig, so that each group has seen all sides."""
+    groups = -(-len(views) // GROUP)
+    masks: list[Mask] = [np.zeros(0, np.uint8)] * len(views)
+    for n in range(groups):
+        masks[n::groups] = _cut(views[n::groups], looks[n::groups])
+    return masks
 
 
 def _cut(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
