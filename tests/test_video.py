@@ -349,6 +349,22 @@ def test_phantoms_of_few_silhouettes_are_no_targets():
     assert 0.4 * len(surface.faces) < len(kept.faces) < 0.6 * len(surface.faces)
 
 
+def test_a_target_on_its_own_stands_apart_for_most_cameras():
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 3, indexing="ij"), -1)
+    large, small = (np.abs(x) < 0.35).all(-1), (np.abs(x - (0.85, 0, 0)) < 0.12).all(-1)
+    hull = Occupancy(np.full(3, -1.0), 0.05, large | small)
+
+    def targets(*centers):
+        cameras = [look_at(c, (0, 0, 0), (300, 200), 3000.0) for c in centers]
+        return find_targets(hull, [shadow(hull, c, 0.1) for c in cameras], cameras, 0.01)[0]
+
+    # Seen along x the small one is before or behind the large one.
+    along, across = [(40, 0, 0), (-40, 0, 0)], [(0, 40, 0), (0, -40, 0), (0, 28, 28)]
+    assert len(targets(*along, *across[:2])) == 1
+    assert len(targets(*along, *across)) == 2
+    assert len(targets(*across)) == 2
+
+
 @given(st.floats(-8, 8), st.tuples(*[st.floats(-0.3, 0.3)] * 3))
 def test_the_motion_of_a_hull_is_found(angle, shift):
     x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 3, indexing="ij"), -1)

@@ -30,7 +30,7 @@ LEAST_PART = 0.003
 JOINED = 0.12
 """Share of a target's length within which another part of the hull belongs to it."""
 SEEN_ALONE = 0.1
-"""Share of a part's shadow that some camera must see beside those of larger parts."""
+"""Share of a part's shadow that a camera must see beside those of larger parts: some camera, or of a part on its own most cameras."""
 MEMORY = 5
 """Instants for which a target that is not seen is remembered."""
 
@@ -60,8 +60,8 @@ def find_targets(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camer
     """The targets that a hull shows, the one with the largest part first.
 
     Each is a connected part with at least the share ``least`` of the largest part's volume, and the parts close to it: a mask with a gap
-    cuts a leg off. Few silhouettes also leave phantoms, parts that show nothing of any mask but what larger ones show already; they are
-    none.
+    cuts a leg off. Few silhouettes also leave phantoms: parts that show nothing of any mask but what larger ones show already, or, where a
+    limb that one camera lost is in no hull, what only half of the cameras or fewer have beside them. They are none.
     """
     padded = np.pad(np.where(hull.occupied, -1.0, 1.0).astype(np.float32), 1, constant_values=1.0)
     points, faces = marching_cubes(padded)
@@ -78,14 +78,15 @@ def find_targets(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camer
             break
         own = np.ascontiguousarray(vertices[np.unique(faces[part == number])])
         shadows = [(splat(own, hull.voxel, camera) > 0) & (m > 0) for camera, m in zip(cameras, masks, strict=True)]
-        if all(np.count_nonzero(s & ~o) <= SEEN_ALONE * np.count_nonzero(s) for s, o in zip(shadows, shown, strict=True)):
+        alone = [np.count_nonzero(s & ~o) > SEEN_ALONE * np.count_nonzero(s) for s, o in zip(shadows, shown, strict=True) if s.any()]
+        if not any(alone):
             continue
         close = [n for n, body in enumerate(bodies) if (_core.nearest(own, body, JOINED * _length(body))[1] >= 0).any()]
         if close:
             target = close[0]
             bodies[target] = np.concatenate([bodies[target], own])
             volumes[target] += float(every[number])
-        elif every[number] >= least * every.max():
+        elif every[number] >= least * every.max() and 2 * sum(alone) > len(alone):
             target = len(bodies)
             bodies.append(own)
             volumes.append(float(every[number]))
