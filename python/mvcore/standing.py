@@ -51,7 +51,7 @@ def ground(points: NDArray[np.float64], cameras: Sequence[Camera], tolerance: fl
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     a, normals = a[lengths > 0], normals[lengths > 0] / lengths[lengths > 0, None]
-    normals *= np.sign(normals @ centers.mean(0) - (normals * a).sum(1))[:, None]
+    normals[normals @ centers.mean(0) < (normals * a).sum(1)] *= -1
     offsets = (normals * a).sum(1)
     heights = some @ normals.T - offsets
     score = (np.abs(heights) < tolerance).mean(0) - 2 * (heights < -3 * tolerance).mean(0)
@@ -62,7 +62,7 @@ def ground(points: NDArray[np.float64], cameras: Sequence[Camera], tolerance: fl
     near = points[np.abs(points @ normals[best] - offsets[best]) < tolerance]
     middle = near.mean(0)
     normal = np.linalg.svd((near - middle)[:20000], full_matrices=False)[2][2]
-    normal *= np.sign(normal @ normals[best])
+    normal = normal if normal @ normals[best] > 0 else -normal
     return Plane(normal, float(normal @ middle))
 
 
@@ -129,8 +129,9 @@ def find_standing(
 
     Returns
     -------
-    None where there is no ground, the cameras do not stand all around, the silhouettes do not
-    agree, or the depth maps do without. ``report.values["standing"]`` says which.
+    Standing
+        With the silhouettes; None where there is no ground, the cameras do not stand all around, the silhouettes do not agree, or the
+        depth maps do without. ``report.values["standing"]`` says which.
     """
     config, carving, report = config or StandingConfig(), carving or CarveConfig(), report or Report()
     said = report.values["standing"] = {"silhouettes": False}
