@@ -156,6 +156,19 @@ def test_depth_is_looked_for_where_the_mask_wants_it(ring):
     assert (here.confidence[here.depth == 0] == 0).all()
 
 
+def test_black_pictures_have_no_depth(ring):
+    cameras, images, _, masks = ring
+    night = [
+        np.where((np.arange(240) < 70)[None, :, None], np.random.default_rng(n).integers(0, 8, i.shape), i) for n, i in enumerate(images)
+    ]
+    views = [View(cv2.cvtColor(i.astype(np.uint8), cv2.COLOR_RGB2GRAY), c, i.astype(np.uint8)) for i, c in zip(night, cameras)]
+    views[0].colour[60:80, 100:120] = (0, 0, 60)  # hardly any grey, but seen
+    found = estimate_depth(views[0], [views[j] for j in (10, 11, 1, 2)], 1.2, 2.6)
+    assert (found.depth[:, :69] == 0).all()
+    assert (found.confidence[:, :69] == 0).all()
+    assert (found.depth[:, 72:] > 0)[masks[0][:, 72:]].mean() > 0.99
+
+
 def test_depth_needs_sources_and_a_range(ring):
     cameras, images, _, _ = ring
     view = View(cv2.cvtColor(images[0], cv2.COLOR_RGB2GRAY), cameras[0])

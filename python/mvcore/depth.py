@@ -367,7 +367,7 @@ def refine_depth(
 ) -> DepthMap:
     """Second pass: refined at half size with the sources' own depth as a witness, then at full size.
 
-    ``rough_sources`` are the first passes of the sources, one each, or empty.
+    ``rough_sources`` are the first passes of the sources, one each, or empty. Where the picture is black there is no depth.
     """
     config = config or DepthConfig()
     found = rough.hypotheses
@@ -378,7 +378,18 @@ def refine_depth(
     # At full size each view is on its own again: errors that views hand to each other would pass the filter together.
     found = _finer(found, full, config.rounds, config)
     h, w = found.planes.shape[:2]
-    return _depth_map(found.planes, cv2.resize(found.margin, (w, h), interpolation=cv2.INTER_LINEAR))
+    planes = np.where(_unexposed(reference)[..., None], np.float32(0), found.planes)
+    return _depth_map(planes, cv2.resize(found.margin, (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+UNEXPOSED = 10
+"""Grey levels below which a pixel and all around it show the camera's noise and nothing else."""
+
+
+def _unexposed(view: View) -> NDArray[np.bool_]:
+    """Where a picture is black: night, a black cloth, the border that undistortion leaves. Nothing can be matched there."""
+    brightest = view.grey if view.colour is None else view.colour.max(2)
+    return np.asarray(cv2.dilate(brightest, np.ones((3, 3), np.uint8)) < UNEXPOSED)
 
 
 def estimate_depth(reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None) -> DepthMap:
