@@ -224,6 +224,29 @@ def test_silhouettes_alone_give_the_hull(ring):
     assert np.median(radius) < 0.53
 
 
+def test_few_depths_do_not_overrule_silhouettes_and_many_do(ring):
+    cameras, _, depths, masks = ring
+    cut = [(m * 255).astype(np.uint8) for m in masks]
+    bounds = np.array([[-0.8, -0.8, -0.8], [0.8, 0.8, 0.8]])
+    # All views have a dent on one side: its middle lies 0.1 deeper than the ball's surface.
+    dents = []
+    for camera, depth, mask in zip(cameras, depths, masks):
+        points = camera.unproject(camera.pixel_grid().reshape(-1, 2), np.maximum(depth, 1e-3).ravel()).reshape(*depth.shape, 3)
+        dents.append(mask & (points[..., 0] > 0.35))
+
+    def radii(known):
+        maps = [
+            DepthMap(np.where(k, d + 0.1 * t, 0).astype(np.float32), np.full(d.shape, 0.5, np.float32))
+            for k, d, t in zip(known, depths, dents)
+        ]
+        v = extract_surface(fuse(maps, cameras, bounds, cut, VolumeConfig(voxel=0.03))).vertices
+        return np.linalg.norm(v[v[:, 0] > 0.42], axis=1)
+
+    chance = [t & (np.random.default_rng(n).random(t.shape) < 0.1) for n, t in enumerate(dents)]
+    assert np.median(radii(chance)) > 0.47
+    assert len(radii(masks)) < 0.5 * len(radii(chance))
+
+
 def test_an_occluder_in_a_mask_is_found_by_the_other_views_depth(ring):
     cameras, _, depths, masks = ring
     maps = [DepthMap(d.astype(np.float32), np.ones(d.shape, np.float32)) for d in depths]

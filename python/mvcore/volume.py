@@ -133,6 +133,7 @@ class _Fusion:
     silhouettes: list[NDArray[np.float32]] | None
     windows: list[Window]
     complete: bool
+    open_share: float
     projections: NDArray[np.float64]
     bounds: Bounds
     config: VolumeConfig
@@ -157,6 +158,7 @@ class _Fusion:
             None if outlines is None else [silhouette_distance(m) for m in outlines],
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
             masks is None and found is not None,
+            0.0 if outlines is None else _open_share(depths, outlines),
             np.stack([c.projection for c in cameras]),
             bounds,
             config,
@@ -185,7 +187,7 @@ class _Fusion:
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
-            solid_weight=(config.completed_share if self.complete else config.solid_share) * len(self.depths),
+            solid_weight=config.solid_share * self.open_share * len(self.depths),
             smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
             hull_tolerance=config.hull_tolerance,
             complete=self.complete,
@@ -293,6 +295,12 @@ def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
         raise ReconstructionError("no surface lies inside the bounds: check the bounds, the masks and the depth maps")
     blocks, most = sum(p[0] for p in parts), max(p[1] for p in parts)
     report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
+
+
+def _open_share(depths: Sequence[DepthMap], masks: Sequence[NDArray[np.uint8]]) -> float:
+    """Share of the masks' pixels without depth, the mean of the views that show anything."""
+    shares = [float((d.depth[m > 0] == 0).mean()) for d, m in zip(depths, masks, strict=True) if m.any()]
+    return float(np.mean(shares)) if shares else 1.0
 
 
 def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
