@@ -30,6 +30,11 @@ class Occupancy:
     voxel: float
     occupied: NDArray[np.bool_]
 
+    def box(self, margin: float = 1.0) -> Bounds:
+        """Of the full voxels, wider by ``margin`` voxels on every side, (2, 3) world; some voxel must be full."""
+        full = np.argwhere(self.occupied)
+        return np.asarray(self.origin + self.voxel * np.stack([full.min(0) - margin, full.max(0) + margin]))
+
     def shell(self) -> NDArray[np.float64]:
         """World positions (n, 3) of the full voxels that have an empty neighbour."""
         o = self.occupied
@@ -136,13 +141,29 @@ def target_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds
     Near few cameras, or outside most pictures, hardly anything speaks against a voxel. So as many cameras must see a voxel as the
     masks allow: the most for which the hull still covers them.
     """
-    if len(masks) > MOST_VIEWS:  # the kernel counts votes in bytes; so many views spread evenly say the same of a box
-        chosen = np.linspace(0, len(masks) - 1, MOST_VIEWS).round().astype(int)
-        masks, cameras = [masks[n] for n in chosen], [cameras[n] for n in chosen]
+    masks, cameras = at_most(MOST_VIEWS, masks, cameras)
     counts = sorted({max(2, round(share * len(cameras))) for share in (1.0, 0.75, 0.5, 0.25)}, reverse=True)
     hulls = [_tight_hull(masks, cameras, bounds, config, least) for least in counts]
     covered = [_covered(h, masks, cameras) for h in hulls]
     return next(h for h, share in zip(hulls, covered, strict=True) if share >= EXPLAINED * max(covered))
+
+
+def at_most(count: int, masks: Sequence[Mask], cameras: Sequence[Camera]) -> tuple[Sequence[Mask], Sequence[Camera]]:
+    """Views spread evenly: the kernel counts votes in bytes, and as many as it takes say the same of a hull as all."""
+    if len(masks) <= count:
+        return masks, cameras
+    chosen = np.linspace(0, len(masks) - 1, count).round().astype(int)
+    return [masks[n] for n in chosen], [cameras[n] for n in chosen]
+
+
+def large_parts(mask: Mask, share: float) -> Mask:
+    """The parts of a mask (0 and 1) that have at least ``share`` of the largest part's pixels, and 16."""
+    count, part, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count <= 1:
+        return mask
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    return (area >= max(16, share * area.max()))[part].astype(np.uint8)
 
 
 def _covered(hull: Occupancy, masks: Sequence[Mask], cameras: Sequence[Camera]) -> float:
@@ -159,10 +180,9 @@ def _tight_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds
         voxel = float((box[1] - box[0]).max()) / (config.resolution - 1)
         grown = [_grown(m, c, box, voxel) for m, c in zip(masks, cameras, strict=True)]
         hull = carve_silhouettes(grown, cameras, box, voxel=voxel, tolerance=config.tolerance, least_views=least)
-        full = np.argwhere(hull.occupied)
-        if not len(full):
+        if not hull.occupied.any():
             break
-        box = hull.origin + hull.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
+        box = hull.box()
     return hull
 
 
@@ -177,8 +197,7 @@ def supported(
     hull = target_hull(masks, cameras, bounds, config)
     box = np.asarray(bounds, np.float64)
     if hull.occupied.any():
-        full = np.argwhere(hull.occupied)
-        box = hull.origin + hull.voxel * np.stack([full.min(0) - 2.0, full.max(0) + 2.0])
+        box = hull.box(2.0)
     voxel = float((box[1] - box[0]).max()) / (config.resolution - 1)
     grown = [_grown(m, c, box, voxel) for m, c in zip(masks, cameras, strict=True)]
     found = []

@@ -276,8 +276,7 @@ def _target(cameras: Sequence[Camera], points: SparsePoints, masks: Masks | None
     if masks is None:
         return box
     hull = target_hull(masks, cameras, box, config)
-    full = np.argwhere(hull.occupied)
-    return box if not len(full) else hull.origin + hull.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
+    return hull.box() if hull.occupied.any() else box
 
 
 def _say_left_out(sources: list[list[int]], cameras: Sequence[Camera], report: Report) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import Camera
-from .carve import carve_silhouettes, shadow, target_hull
+from .carve import MOST_VIEWS, at_most, carve_silhouettes, large_parts, shadow, target_hull
 from .config import CarveConfig, StandingConfig
 from .io.images import reduce
 from .types import Bounds, DepthMap, Image, Report
@@ -41,7 +41,10 @@ HYPOTHESES = 1000
 
 
 def ground(points: NDArray[np.float64], cameras: Sequence[Camera], tolerance: float, share: float) -> Plane | None:
-    """The plane that at least ``share`` of the points (n, 3) lie on and next to none under, all cameras above; None without."""
+    """The plane that at least ``share`` of the points (n, 3) lie on and next to none under, all cameras above; None without.
+
+    RANSAC (Fischler and Bolles, CACM 1981) with a fixed seed; ``tolerance`` is in world units.
+    """
     if len(points) < 3:
         return None
     random = np.random.default_rng(0)
@@ -67,7 +70,7 @@ def ground(points: NDArray[np.float64], cameras: Sequence[Camera], tolerance: fl
 
 
 def widest_gap(cameras: Sequence[Camera], middle: NDArray[np.float64], plane: Plane) -> float:
-    """Degrees of the widest gap between neighbouring cameras as seen from above the ground."""
+    """Degrees of the widest gap between neighbouring cameras around ``middle`` (3,) as seen from above the ground."""
     away = np.stack([c.center for c in cameras]) - middle
     across = np.linalg.svd(plane.normal[None])[2][1:]
     angles = np.sort(np.degrees(np.arctan2(*(away @ across.T).T)))
@@ -86,10 +89,6 @@ class Standing:
     bounds: Bounds
     tolerance: float
 
-    def kinds(self, points: NDArray[np.float64]) -> tuple[Bool, Bool]:
-        """Of points (n, 3): which surely stand, which surely do not."""
-        return _kinds(points, self.plane, self.bounds, self.tolerance)
-
     def agreeing(self, depths: Sequence[DepthMap | None], cameras: Sequence[Camera]) -> list[DepthMap | None]:
         """Depth maps without what the silhouettes contradict: standing points beside them, background within."""
         return [self._kept(*v) for v in zip(depths, cameras, self.silhouettes, strict=True)]
@@ -97,19 +96,24 @@ class Standing:
     def _kept(self, view: DepthMap | None, camera: Camera, mask: Mask) -> DepthMap | None:
         if view is None:
             return None
-        pixels, points = _points(view, camera, 1)
-        stands, lies = self.kinds(points)
-        within = mask[pixels[:, 1], pixels[:, 0]] > 0
-        wrong = pixels[np.where(within, lies, stands)]
-        depth = view.depth.copy()
-        depth[wrong[:, 1], wrong[:, 0]] = 0
-        return DepthMap(depth, view.confidence)
+        kinds = _kinds(view, camera, self.plane, self.bounds, self.tolerance)
+        wrong = kinds == np.where(mask > 0, LIES, STANDS)
+        return DepthMap(np.where(wrong, np.float32(0), view.depth), np.where(wrong, np.float32(0), view.confidence))
 
 
-def _kinds(points: NDArray[np.float64], plane: Plane, bounds: Bounds, tolerance: float) -> tuple[Bool, Bool]:
+STANDS, LIES, BETWEEN = 1, 2, 3
+"""What a pixel with depth shows: surely what stands inside the bounds, surely something else, either."""
+
+
+def _kinds(view: DepthMap | None, camera: Camera, plane: Plane, bounds: Bounds, tolerance: float) -> Mask:
+    """Of each pixel, (h, w) uint8; 0 without depth."""
+    kinds = np.zeros((camera.height, camera.width), np.uint8)
+    pixels, points = _points(view, camera, 1)
     height = plane.height(points)
     inside = ((points > bounds[0]) & (points < bounds[1])).all(1)
-    return inside & (height > 2 * tolerance), ~inside | (height < tolerance)
+    found = np.where(inside & (height > 2 * tolerance), STANDS, np.where(~inside | (height < tolerance), LIES, BETWEEN))
+    kinds[pixels[:, 1], pixels[:, 0]] = found
+    return kinds
 
 
 def find_standing(
@@ -147,9 +151,10 @@ def find_standing(
     if said["widest_gap"] > config.max_gap:
         said["why"] = "the cameras do not stand all around"
         return None
+    kinds = [_kinds(d, c, plane, bounds, tolerance) for d, c in zip(depths, cameras, strict=True)]
     masks: list[Mask] = []
     for side in (config.look_size, config.max_size):
-        views = [_seeds(*v, plane, bounds, tolerance, side) for v in zip(images, cameras, depths, strict=True)]
+        views = [_seeds(*v, side) for v in zip(images, cameras, kinds, strict=True)]
         masks = _cut_in_groups(views, masks)
         if not all(m.any() for m in masks):
             said["why"] = "some view shows nothing that stands"
@@ -187,22 +192,21 @@ class _Seeds:
     known: Bool
 
 
-def _seeds(image: Image, camera: Camera, depth: DepthMap | None, plane: Plane, bounds: Bounds, tolerance: float, side: int) -> _Seeds:
+def _seeds(image: Image, camera: Camera, kinds: Mask, side: int) -> _Seeds:
+    """A view with its longer side at most ``side`` pixels."""
     small, reduced = reduce(image, camera, side)
-    pixels, points = _points(depth, camera, 1)
-    kinds = (*_kinds(points, plane, bounds, tolerance), np.ones(len(points), bool))
 
-    def shown(kind: Bool) -> Bool:
-        full = np.zeros(image.shape[:2], np.uint8)
-        full[pixels[kind, 1], pixels[kind, 0]] = 255
-        return np.asarray(cv2.resize(full, (reduced.width, reduced.height), interpolation=cv2.INTER_AREA) > 127)
+    def shown(kind: Bool) -> Mask:
+        share = cv2.resize(kind.astype(np.uint8) * np.uint8(255), (reduced.width, reduced.height), interpolation=cv2.INTER_AREA)
+        return (share > 127).astype(np.uint8)
 
-    target, background, known = map(shown, kinds)
     kernel = np.ones((3, 3), np.uint8)
-    sure = [cv2.erode(m.astype(np.uint8), kernel) > 0 for m in (target, background)]
-    return _Seeds(small, reduced, sure[0], sure[1], known)
+    target, background = (cv2.erode(shown(kinds == k), kernel) > 0 for k in (STANDS, LIES))
+    return _Seeds(small, reduced, target, background, shown(kinds > 0) > 0)
 
 
+CUT_ROUNDS = 2
+"""Rounds of GrabCut, as for clips: the first learns from the seeds, the second from what it found."""
 GROUP = 16
 """Views that are cut together: enough to know the colours, few enough for memory."""
 
@@ -236,11 +240,11 @@ def _cut(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
     if not (label & 1).any() or (label & 1).all():
         return masks
     cv2.setRNGSeed(0)  # its k-means: the same masks each time
-    cv2.grabCut(np.concatenate(pictures), label, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(np.concatenate(pictures), label, None, np.zeros((1, 65)), np.zeros((1, 65)), CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     for mask, window, part in zip(masks, windows, np.split(label, np.cumsum([len(part) for part in labels])[:-1]), strict=True):
         inside = mask[window]
         inside[:] = part[:-1, : inside.shape[1]] & 1
-    return [_large(m) for m in masks]
+    return [large_parts(m, LEAST_PART) for m in masks]
 
 
 MARGIN = 0.15
@@ -262,21 +266,13 @@ LEAST_PART = 0.05
 """Share of the largest part's pixels below which a part is dropped."""
 
 
-def _large(mask: Mask) -> Mask:
-    count, part, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA].copy()
-    area[0] = 0
-    return (area >= max(1, LEAST_PART * area.max()))[part].astype(np.uint8) if count > 1 else mask
-
-
 def _agreement(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> float:
     """Median over the views of intersection over union of a mask and what their common hull shows there."""
+    masks, cameras = at_most(MOST_VIEWS, masks, cameras)
     around = target_hull(masks, cameras, bounds, config)
-    full = np.argwhere(around.occupied)
-    if not len(full):
+    if not around.occupied.any():
         return 0.0
-    box = around.origin + around.voxel * np.stack([full.min(0) - 1.0, full.max(0) + 1.0])
-    hull = carve_silhouettes(masks, cameras, box, tolerance=0.5 * config.tolerance)
+    hull = carve_silhouettes(masks, cameras, around.box(), tolerance=0.5 * config.tolerance)
     shown = [shadow(hull, c) > 0 for c in cameras]
     return float(np.median([(s & (m > 0)).sum() / (s | (m > 0)).sum() for s, m in zip(shown, masks, strict=True)]))
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import Camera
-from .carve import supported
+from .carve import large_parts, supported
 from .config import CarveConfig, TargetConfig
 from .errors import require
 from .io.images import reduce
@@ -89,17 +89,7 @@ def _evidence(image: Image, background: Background, config: TargetConfig) -> _Ev
 def _cleaned(mask: Mask, config: TargetConfig) -> Mask:
     """Without specks, closed, parts of some size only."""
     mask = cv2.morphologyEx(cv2.medianBlur(mask, 5), cv2.MORPH_OPEN, _disc(3))
-    return _large(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(9)), config.least_part)
-
-
-def _large(mask: Mask, share: float) -> Mask:
-    """The parts that have at least ``share`` of the largest part's pixels."""
-    count, part, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    if count <= 1:
-        return mask
-    area = stats[:, cv2.CC_STAT_AREA].copy()
-    area[0] = 0
-    return (area >= max(16, share * area.max()))[part].astype(np.uint8)
+    return large_parts(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(9)), config.least_part)
 
 
 Models = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -209,15 +199,15 @@ def foreground(
     if bounds is not None and len(images) > 2:
         # Masks grow a little first: what one camera misses by a pixel must not cost the others theirs.
         seen = supported([cv2.dilate(r, _disc(7)) for r in rough], reduced, bounds, carving, carving.tolerance)
-        rough = [_large(r & (s > 0), config.least_part) for r, s in zip(rough, seen, strict=True)]
+        rough = [large_parts(r & (s > 0), config.least_part) for r, s in zip(rough, seen, strict=True)]
         outside = [o | (s == 0) for o, s in zip(outside, seen, strict=True)]
     found_cuts = [_cut(p, r, o, u, config.cut_rounds) for p, r, o, u in zip(small, rough, outside, unknown, strict=True)]
-    cuts = [_large(c, config.least_part) for c, _ in found_cuts]
+    cuts = [large_parts(c, config.least_part) for c, _ in found_cuts]
     if bounds is not None and len(images) > 2 and any(u.any() for u in unknown):
         seen = supported([cv2.dilate(c, _disc(3)) for c in cuts], reduced, bounds, carving, 0.0, len(images) - 1)
         sure = [s if (s == 0).any() else np.zeros_like(s) for s in seen]  # the others have nothing in common
         told = zip(small, cuts, sure, found, unknown, found_cuts, strict=True)
-        cuts = [_large(_agreed(p, c, s, u & ~e.background, m), config.least_part) for p, c, s, e, u, (_, m) in told]
+        cuts = [large_parts(_agreed(p, c, s, u & ~e.background, m), config.least_part) for p, c, s, e, u, (_, m) in told]
     masks = []
     for cut, image in zip(cuts, images, strict=True):
         h, w = image.shape[:2]
@@ -338,7 +328,7 @@ def _moving(samples: NDArray[np.uint8], config: TargetConfig) -> Mask:
     often = sum((mog.apply(s, learningRate=0) == 255).astype(int) for s in smooth)
     changes = ((high - low).max(-1) > 1.8 * config.threshold) | (often > 0.1 * len(samples))
     region = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_OPEN, _disc(3))
-    region = _large(cv2.morphologyEx(region, cv2.MORPH_CLOSE, _disc(21)), 0.1)
+    region = large_parts(cv2.morphologyEx(region, cv2.MORPH_CLOSE, _disc(21)), 0.1)
     outer = np.pad(region, 1)
     cv2.floodFill(outer, None, (0, 0), 2)
     return cv2.dilate((outer[1:-1, 1:-1] != 2).astype(np.uint8), _disc(5))

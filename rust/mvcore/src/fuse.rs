@@ -6,7 +6,8 @@
 //!
 //! Voxels farther than τ in front of a surface get +τ from that view: free space carves what other views put there by mistake.
 //! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid; or they only
-//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Curless and Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
+//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Curless and
+//! Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
 //! order: the same bytes for any thread count.
 
 use crate::error::{Error, Result, require};
