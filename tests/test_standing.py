@@ -92,6 +92,32 @@ def test_many_views_are_cut_in_groups_with_like_results(stand, monkeypatch):
         assert ((s > 0) & m).sum() / ((s > 0) | m).sum() > 0.93
 
 
+def test_a_view_that_shows_nothing_sure_learns_from_the_others(stand):
+    cameras, images, maps, masks = stand
+    shaded, unknown = list(images), list(maps)
+    for n in (2, 7):
+        shaded[n] = np.where(masks[n][..., None], (images[n] * 0.45).astype(np.uint8), images[n])
+        unknown[n] = DepthMap(np.where(masks[n], 0, maps[n].depth).astype(np.float32), maps[n].confidence)
+    found = find_standing(shaded, cameras, unknown, BOUNDS)
+    for s, m in zip(found.silhouettes, masks):
+        assert ((s > 0) & m).sum() / ((s > 0) | m).sum() > 0.93
+
+
+def test_what_the_other_views_rule_out_is_no_part_of_a_silhouette(stand):
+    cameras, images, maps, masks = stand
+    right, middle = int(np.nonzero(masks[4].any(0))[0][-1]), int(np.nonzero(masks[4].any(1))[0].mean())
+    beside = np.zeros(masks[4].shape, bool)
+    beside[middle - 30 : middle + 30, right - 20 : right + 60] = True
+    beside &= ~masks[4]
+    painted, unknown = list(images), list(maps)
+    painted[4] = np.where(beside[..., None], np.uint8([230, 190, 30]), images[4])
+    unknown[4] = DepthMap(np.where(beside, 0, maps[4].depth).astype(np.float32), maps[4].confidence)
+    found = find_standing(painted, cameras, unknown, BOUNDS)
+    shown = found.silhouettes[4] > 0
+    assert (shown & beside).sum() < 0.3 * beside.sum()
+    assert (shown & masks[4]).sum() > 0.97 * masks[4].sum()
+
+
 def test_silhouettes_are_not_trusted_without_reason(stand):
     cameras, images, maps, masks = stand
 

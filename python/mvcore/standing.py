@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import Camera
-from .carve import MOST_VIEWS, at_most, carve_silhouettes, large_parts, shadow, target_hull
+from .carve import MOST_VIEWS, Occupancy, at_most, carve_silhouettes, large_parts, shadow, target_hull
 from .config import CarveConfig, StandingConfig
 from .io.images import reduce
 from .types import Bounds, DepthMap, Image, Report
@@ -153,21 +153,29 @@ def find_standing(
         return None
     kinds = [_kinds(d, c, plane, bounds, tolerance) for d, c in zip(depths, cameras, strict=True)]
     masks: list[Mask] = []
-    for side in (config.look_size, config.max_size):
+    small: list[Camera] = []
+    # The smaller size is a quick look: what most views show there tells the others where to look.
+    for side, least in ((config.look_size, config.min_shown), (config.max_size, 1.0)):
         views = [_seeds(*v, side) for v in zip(images, cameras, kinds, strict=True)]
-        masks = _cut_in_groups(views, masks)
-        if not all(m.any() for m in masks):
+        looks = _shadows(_common_hull(masks, small, bounds, carving), small) if masks else []
+        if not all(look.any() for look in looks):
+            said["why"] = "the silhouettes disagree"
+            return None
+        masks, small = _cut_in_groups(views, looks), [v.camera for v in views]
+        shown = [v.known[m > 0].mean() for v, m in zip(views, masks, strict=True) if m.any()]
+        if len(shown) < max(1.0, least * len(views)):
             said["why"] = "some view shows nothing that stands"
             return None
-        # The smaller size is a quick look.
-        said["measured"] = round(float(np.mean([v.known[m > 0].mean() for v, m in zip(views, masks, strict=True)])), 3)
+        said["measured"] = round(float(np.mean(shown)), 3)
         if said["measured"] > config.max_measured:
             said["why"] = "the depth maps show most of it"
             return None
-    said["agreement"] = round(_agreement(masks, [v.camera for v in views], bounds, carving), 3)
+    hull = _common_hull(masks, small, bounds, carving)
+    said["agreement"] = round(_agreement(masks, _shadows(hull, small)), 3)
     if said["agreement"] < config.min_agreement:
         said["why"] = "the silhouettes disagree"
         return None
+    masks = [m & s for m, s in zip(masks, _shadows(hull, small, 2.0), strict=True)]
     said["silhouettes"] = True
     return Standing([_enlarged(m, c) for m, c in zip(masks, cameras, strict=True)], plane, bounds, tolerance)
 
@@ -223,14 +231,17 @@ def _cut_in_groups(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]
 def _cut(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
     """GrabCut over all views as one picture, so that they share their colours; parts of some size only. 0 and 1.
 
-    ``looks`` are masks of smaller images, if any: only what is around them is cut.
+    ``looks`` are masks of smaller images, if any: the likely target. Only what is around them is cut.
     """
     shapes = [v.image.shape[:2] for v in views]
     windows = [_around(*v) for v in zip(looks, shapes, strict=True)] if looks else [np.s_[0:h, 0:w] for h, w in shapes]
     width = max(x.stop - x.start for _, x in windows)
     pictures, labels = [], []
-    for v, w in zip(views, windows, strict=True):
-        label = np.where(v.target, cv2.GC_FGD, np.where(v.background, cv2.GC_BGD, cv2.GC_PR_BGD)).astype(np.uint8)[w]
+    for n, (v, w) in enumerate(zip(views, windows, strict=True)):
+        likely = np.full(v.image.shape[:2], cv2.GC_PR_BGD)
+        if looks:
+            likely[cv2.resize(looks[n], likely.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = cv2.GC_PR_FGD
+        label = np.where(v.target, cv2.GC_FGD, np.where(v.background, cv2.GC_BGD, likely)).astype(np.uint8)[w]
         # A row and a column between the pictures belong to none.
         fill = ((0, 1), (0, width + 1 - label.shape[1]))
         labels.append(np.pad(label, fill, constant_values=cv2.GC_BGD))
@@ -266,15 +277,24 @@ LEAST_PART = 0.05
 """Share of the largest part's pixels below which a part is dropped."""
 
 
-def _agreement(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> float:
-    """Median over the views of intersection over union of a mask and what their common hull shows there."""
-    masks, cameras = at_most(MOST_VIEWS, masks, cameras)
+def _common_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Occupancy:
+    """The hull of the views that show something; empty where they have nothing in common."""
+    seen = [n for n, m in enumerate(masks) if m.any()]
+    masks, cameras = at_most(MOST_VIEWS, [masks[n] for n in seen], [cameras[n] for n in seen])
     around = target_hull(masks, cameras, bounds, config)
     if not around.occupied.any():
-        return 0.0
-    hull = carve_silhouettes(masks, cameras, around.box(), tolerance=0.5 * config.tolerance)
-    shown = [shadow(hull, c) > 0 for c in cameras]
-    return float(np.median([(s & (m > 0)).sum() / (s | (m > 0)).sum() for s, m in zip(shown, masks, strict=True)]))
+        return around
+    return carve_silhouettes(masks, cameras, around.box(), tolerance=0.5 * config.tolerance)
+
+
+def _shadows(hull: Occupancy, cameras: Sequence[Camera], grow: float = 0.5) -> list[Mask]:
+    """What each view shows of it, 0 and 1. A voxel's cube reaches as far as its diagonal: half of it is the hull's own outline."""
+    return [(shadow(hull, c, grow) > 0).astype(np.uint8) for c in cameras]
+
+
+def _agreement(masks: Sequence[Mask], shadows: Sequence[Mask]) -> float:
+    """Median over the views of intersection over union of a mask and the common hull's shadow."""
+    return float(np.median([(s & m).sum() / max(1, (s | m).sum()) for s, m in zip(shadows, masks, strict=True)]))
 
 
 def _enlarged(mask: Mask, camera: Camera) -> Mask:
