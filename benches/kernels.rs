@@ -12,6 +12,7 @@ use mvcore::consistency::{ConsistencyParams, OtherView, consistency};
 use mvcore::expect::expect;
 use mvcore::fuse::{FusionParams, FusionView, fuse};
 use mvcore::grid::Grid;
+use mvcore::holes::close_holes;
 use mvcore::isosurface::{isosurface_dense, isosurface_sparse};
 use mvcore::match_epipolar::{DESCRIPTOR, Features, match_epipolar};
 use mvcore::mesh::Mesh;
@@ -286,6 +287,10 @@ fn meshes(c: &mut Criterion) {
     let sources: Vec<_> =
         (0..8).map(|k| Source { rgb: image, projection: ring(8, k, w, h, focal).0, gain: [1.0; 3] }).collect();
     group.bench_function("build_atlas, 8 views", |b| b.iter(|| build_atlas(mesh, &labels, &sources, 8192).unwrap()));
+    // Every thirtieth face is missing: some twenty thousand small holes.
+    let kept: Vec<[u32; 3]> = surface.faces.iter().enumerate().filter(|(n, _)| n % 30 > 0).map(|(_, &f)| f).collect();
+    let porous = Mesh::new(&vertices, &kept).unwrap();
+    group.bench_function("close_holes", |b| b.iter(|| close_holes(porous, 120).unwrap()));
     group.throughput(Throughput::Elements(vertices.len() as u64));
     let shifted: Vec<[f64; 3]> = vertices.iter().map(|v| v.map(|x| x * 1.01)).collect();
     group.bench_function("nearest", |b| b.iter(|| nearest(&shifted, &vertices, f64::INFINITY).unwrap()));

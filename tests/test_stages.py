@@ -28,7 +28,7 @@ from mvcore.sparse import (
     target_box,
     view_scores,
 )
-from mvcore.surface import Surface, decimate, drop_small_parts, extract_surface, isosurface, marching_cubes, smooth
+from mvcore.surface import Surface, cleaned, decimate, drop_small_parts, extract_surface, isosurface, marching_cubes, smooth
 from mvcore.texture import colour_gains, texture
 from mvcore.types import DepthMap, Report
 from mvcore.volume import Volume, fuse, fuse_tiles, repaired_masks, silhouette_distance
@@ -350,6 +350,21 @@ def test_small_parts_are_dropped():
     )
     assert len(drop_small_parts(both, 0.2).faces) == len(large.faces)
     assert len(drop_small_parts(both, 0.0).faces) == len(both.faces)
+
+
+def test_small_holes_are_closed_unless_the_settings_say_otherwise():
+    x, y, z = np.mgrid[-20:20, -20:20, -20:20].astype(np.float32)
+    vertices, faces = marching_cubes(np.sqrt(x**2 + y**2 + z**2) - 14.3)
+    middles = vertices[faces].mean(1) - 20
+    small, large = np.linalg.norm(middles - (14.3, 0, 0), axis=1) < 3, middles[:, 0] < -6
+    open_ = Surface(vertices.astype(np.float64), np.ascontiguousarray(faces[~small & ~large]))
+    closed = cleaned(open_, SurfaceConfig(close_holes=40))
+    assert (closed.vertices[closed.faces[: len(open_.faces)]] == open_.vertices[open_.faces]).all()
+    added = closed.vertices[closed.faces[len(open_.faces) :]].mean(1) - 20
+    assert len(added) > 20
+    assert (np.linalg.norm(added - (14.3, 0, 0), axis=1) < 4).all()  # the large one stays
+    assert np.abs(np.linalg.norm(added, axis=1) - 14.3).max() < 0.7
+    assert len(cleaned(open_, SurfaceConfig(close_holes=0)).faces) == len(open_.faces)
 
 
 def test_smoothing_keeps_the_volume_and_decimation_the_shape():

@@ -195,6 +195,8 @@ class SurfaceConfig:
 
     min_component: float = 0.005
     """Parts with a smaller share of the faces than this, relative to the largest, are dropped."""
+    close_holes: int = 120
+    """Holes of at most this many edges (of somewhat less than a voxel) are closed where they lie in the surface; 0 leaves them all."""
     smooth: int = 0
     """Rounds of Taubin smoothing: rounds off noise without shrinking."""
     max_faces: int | None = None

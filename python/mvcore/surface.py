@@ -93,7 +93,7 @@ def extract_surface(volume: Volume | Iterable[Volume], config: SurfaceConfig | N
 
 
 def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
-    """Small parts dropped, then smoothed and decimated as configured.
+    """Small parts dropped and small holes closed, then smoothed and decimated as configured.
 
     ``solid`` says that the surface is closed (silhouettes were given): bubbles inside it are dropped too. Errors as of `extract_surface`.
     """
@@ -103,6 +103,7 @@ def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool =
     if solid:
         surface = drop_cavities(surface)
     surface = drop_small_parts(surface, config.min_component)
+    surface = close_holes(surface, config.close_holes)
     if config.smooth:
         surface = smooth(surface, config.smooth)
     if config.max_faces is not None and len(surface.faces) > config.max_faces:
@@ -130,6 +131,13 @@ def drop_small_parts(surface: Surface, share: float) -> Surface:
     part = _core.components(surface.faces)
     size = np.bincount(part)
     return compact(surface.vertices, surface.faces[size[part] >= share * size.max()])
+
+
+def close_holes(surface: Surface, most_edges: int) -> Surface:
+    """Closes the holes of at most ``most_edges`` edges by the least area, but where the patch would turn back over its surroundings."""
+    if most_edges < 3 or not len(surface.faces):
+        return surface
+    return Surface(surface.vertices, np.concatenate([surface.faces, _core.close_holes(surface.vertices, surface.faces, most_edges)]))
 
 
 def drop_cavities(surface: Surface) -> Surface:

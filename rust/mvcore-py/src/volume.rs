@@ -200,6 +200,22 @@ pub fn components<'py>(
     array(py, part, [n])
 }
 
+/// Faces that close the holes of at most `most_edges` edges.
+#[pyfunction]
+pub fn close_holes<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    most_edges: usize,
+) -> PyResult<Bound<'py, numpy::PyArray2<u32>>> {
+    let vertices = slice(&vertices, "vertices")?.as_chunks::<3>().0;
+    let faces = slice(&faces, "faces")?.as_chunks::<3>().0;
+    let kernel = || mvcore::holes::close_holes(mvcore::mesh::Mesh::new(vertices, faces)?, most_edges);
+    let added = run(py, kernel)?;
+    let n = added.len();
+    array(py, added.into_flattened(), [n, 3])
+}
+
 #[pyfunction]
 #[pyo3(signature = (points, others, reach = f64::INFINITY))]
 pub fn nearest<'py>(

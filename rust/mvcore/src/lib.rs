@@ -16,6 +16,7 @@ pub mod expect;
 pub mod files;
 pub mod fuse;
 pub mod grid;
+pub mod holes;
 pub mod hull;
 pub mod isosurface;
 pub mod level;
