@@ -174,7 +174,7 @@ class StandingConfig:
     min_agreement: float = 0.88
     """Intersection over union of a silhouette and the common hull's, in the median view: less is no outline of one thing."""
     min_shown: float = 0.7
-    """Share of the views that must show it at the first look; their hull tells the others where it is."""
+    """Share of the views that must show it; their hull tells the others where it is."""
     max_gap: float = 90.0
     """Degrees between neighbouring cameras around it: beyond, the hull is more corner than target."""
     ground_share: float = 0.3

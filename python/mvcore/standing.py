@@ -155,27 +155,29 @@ def find_standing(
     masks: list[Mask] = []
     small: list[Camera] = []
     # The smaller size is a quick look: what most views show there tells the others where to look.
-    for side, least in ((config.look_size, config.min_shown), (config.max_size, 1.0)):
+    for side in (config.look_size, config.max_size):
         views = [_seeds(*v, side) for v in zip(images, cameras, kinds, strict=True)]
-        looks = _shadows(_common_hull(masks, small, bounds, carving), small) if masks else []
+        looks = _looks(masks, _shadows(_common_hull(masks, small, bounds, carving), small)) if masks else []
         if not all(look.any() for look in looks):
             said["why"] = "the silhouettes disagree"
             return None
         masks, small = _cut_in_groups(views, looks), [v.camera for v in views]
         shown = [v.known[m > 0].mean() for v, m in zip(views, masks, strict=True) if m.any()]
-        if len(shown) < max(1.0, least * len(views)):
-            said["why"] = "some view shows nothing that stands"
+        if len(shown) < max(1.0, config.min_shown * len(views)):
+            said["why"] = "too few views show anything that stands"
             return None
         said["measured"] = round(float(np.mean(shown)), 3)
         if said["measured"] > config.max_measured:
             said["why"] = "the depth maps show most of it"
             return None
     hull = _common_hull(masks, small, bounds, carving)
-    said["agreement"] = round(_agreement(masks, _shadows(hull, small)), 3)
+    shadows = _shadows(hull, small)
+    said["agreement"] = round(_agreement(masks, shadows), 3)
     if said["agreement"] < config.min_agreement:
         said["why"] = "the silhouettes disagree"
         return None
-    masks = [m & s for m, s in zip(masks, _shadows(hull, small, 2.0), strict=True)]
+    # What the others rule out is not the target; a view that shows nothing takes what they have.
+    masks = [m & w if m.any() else s for m, s, w in zip(masks, shadows, _shadows(hull, small, 2.0), strict=True)]
     said["silhouettes"] = True
     return Standing([_enlarged(m, c) for m, c in zip(masks, cameras, strict=True)], plane, bounds, tolerance)
 
@@ -231,7 +233,7 @@ def _cut_in_groups(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]
 def _cut(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
     """GrabCut over all views as one picture, so that they share their colours; parts of some size only. 0 and 1.
 
-    ``looks`` are masks of smaller images, if any: the likely target. Only what is around them is cut.
+    ``looks`` are of smaller images (`_looks`), if any: only what is around them is cut.
     """
     shapes = [v.image.shape[:2] for v in views]
     windows = [_around(*v) for v in zip(looks, shapes, strict=True)] if looks else [np.s_[0:h, 0:w] for h, w in shapes]
@@ -240,7 +242,7 @@ def _cut(views: Sequence[_Seeds], looks: Sequence[Mask]) -> list[Mask]:
     for n, (v, w) in enumerate(zip(views, windows, strict=True)):
         likely = np.full(v.image.shape[:2], cv2.GC_PR_BGD)
         if looks:
-            likely[cv2.resize(looks[n], likely.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = cv2.GC_PR_FGD
+            likely[cv2.resize(looks[n], likely.shape[::-1], interpolation=cv2.INTER_NEAREST) == LIKELY] = cv2.GC_PR_FGD
         label = np.where(v.target, cv2.GC_FGD, np.where(v.background, cv2.GC_BGD, likely)).astype(np.uint8)[w]
         # A row and a column between the pictures belong to none.
         fill = ((0, 1), (0, width + 1 - label.shape[1]))
@@ -292,9 +294,22 @@ def _shadows(hull: Occupancy, cameras: Sequence[Camera], grow: float = 0.5) -> l
     return [(shadow(hull, c, grow) > 0).astype(np.uint8) for c in cameras]
 
 
+AROUND, LIKELY = 1, 2
+"""What a pixel of a look shows: the common hull, its inside; 0 is neither."""
+RIM = 3
+"""Pixels at a look's border: the hull of coarse voxels is fat, and what is around the target would teach its colours."""
+
+
+def _looks(masks: Sequence[Mask], shadows: Sequence[Mask]) -> list[Mask]:
+    """Where each view shows the common hull; a view whose own mask is empty has only that to learn the target's colours from."""
+    kernel = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
+    inner = [cv2.erode(s, kernel) if m.any() else s for m, s in zip(masks, shadows, strict=True)]
+    return [np.where(i > 0, LIKELY, np.where(s > 0, AROUND, 0)).astype(np.uint8) for i, s in zip(inner, shadows, strict=True)]
+
+
 def _agreement(masks: Sequence[Mask], shadows: Sequence[Mask]) -> float:
-    """Median over the views of intersection over union of a mask and the common hull's shadow."""
-    return float(np.median([(s & m).sum() / max(1, (s | m).sum()) for s, m in zip(shadows, masks, strict=True)]))
+    """Median over the views that show something of intersection over union of a mask and the common hull's shadow."""
+    return float(np.median([(s & m).sum() / (s | m).sum() for s, m in zip(shadows, masks, strict=True) if m.any()]))
 
 
 def _enlarged(mask: Mask, camera: Camera) -> Mask:
