@@ -134,7 +134,7 @@ def drop_small_parts(surface: Surface, share: float) -> Surface:
 
 
 def close_holes(surface: Surface, most_edges: int) -> Surface:
-    """Closes the holes of at most ``most_edges`` edges by the least area, but where the patch would turn back over its surroundings."""
+    """Closes the holes of at most ``most_edges`` edges (1000 or fewer) by the least area, where the patch lies in the surface."""
     if most_edges < 3 or not len(surface.faces):
         return surface
     return Surface(surface.vertices, np.concatenate([surface.faces, _core.close_holes(surface.vertices, surface.faces, most_edges)]))

@@ -1,24 +1,27 @@
 //! Small holes of a mesh closed: the places where a few voxels had no depth.
 //!
 //! ```text
-//!   faces without a neighbour ──walk──► loops of border edges ──shortest first──► least area over all triangulations (i, k, j)
+//!   faces without a neighbour ──walk──► rims of holes ──each──► the triangulation (i, k, j) of least area, if it lies in the surface
 //! ```
 //!
-//! Barequet and Sharir, CAGD 1995. A loop is left open where its patch would turn back over the faces around it, as around the rim of an
-//! open piece of surface, or would need an edge that the mesh has already. Loops are independent: the same faces for any number of threads.
+//! Barequet and Sharir, CAGD 1995. A rim is left open where its patch would turn away from the faces around it, as at a depth edge or around
+//! an open piece of surface, or would need an edge that the mesh has already. Rims are independent: the same faces for any number of threads.
 
-use crate::error::Result;
-use crate::mesh::{Mesh, NOTHING, neighbours};
+use crate::error::{Result, require};
+use crate::mesh::{Mesh, NOTHING, neighbours, normal};
 use rayon::prelude::*;
 use std::collections::{HashMap, HashSet};
 
 /// Twice the least area of a triangle, of its longest edge squared: thinner ones are none.
 const LEAST_AREA: f64 = 1e-6;
 /// Least mean cosine between a patch and the faces around it. Laxer, the ragged fringes at depth edges get false skin (measured).
-const LEAST_TURN: f64 = 0.9;
+const LEAST_COSINE: f64 = 0.9;
+/// Time grows with the cube of a rim's edges, memory with their square.
+const MOST_EDGES: usize = 1000;
 
-/// The faces that close every hole of at most `most_edges` edges; the mesh's vertices are theirs.
+/// The faces that close every hole of at most `most_edges` (1000 or fewer) edges; the mesh's vertices are theirs.
 pub fn close_holes(mesh: Mesh<'_>, most_edges: usize) -> Result<Vec<[u32; 3]>> {
+    require(most_edges <= MOST_EDGES, "most_edges", format!("at most {MOST_EDGES}"), most_edges)?;
     let beyond = neighbours(mesh.faces);
     let loops = border_loops(mesh.faces, &beyond, most_edges);
     let mut touched = vec![false; mesh.vertices.len()];
@@ -90,10 +93,11 @@ fn next_side(faces: &[[u32; 3]], beyond: &[[i32; 3]], side: usize) -> Option<usi
         if next == NOTHING {
             return Some(3 * face + before);
         }
+        let shared = faces[face][before];
         face = next as usize;
         corner = faces[face].iter().position(|&v| v == vertex)?;
         // A neighbour of the other orientation has no rim to follow.
-        if faces[face][(corner + 1) % 3] == vertex || face == side / 3 {
+        if faces[face][(corner + 1) % 3] != shared {
             return None;
         }
     }
@@ -123,21 +127,21 @@ fn patch(mesh: Mesh<'_>, rim: &[Rim], edges: &[u64]) -> Vec<[u32; 3]> {
     if !cost[n - 1].is_finite() {
         return Vec::new();
     }
-    let (mut triangles, mut turn, mut open) = (Vec::with_capacity(n - 2), 0.0, vec![(0, n - 1)]);
+    let (mut triangles, mut cosines, mut open) = (Vec::with_capacity(n - 2), 0.0, vec![(0, n - 1)]);
     while let Some((i, j)) = open.pop() {
         let k = split[i * n + j];
-        let normal = unit(cross([points[i], points[k], points[j]]));
+        let own = unit(normal([points[i], points[k], points[j]]));
         for (a, b) in [(i, k), (k, j), (j, i)] {
             // The rim's own edges: one step on, or from the last to the first.
             if (a + 1) % n == b {
                 let around = unit(mesh.normal(rim[a].face as usize));
-                turn += (0..3).map(|c| normal[c] * around[c]).sum::<f64>();
+                cosines += (0..3).map(|c| own[c] * around[c]).sum::<f64>();
             }
         }
         triangles.push([rim[i].from, rim[k].from, rim[j].from]);
         open.extend([(i, k), (k, j)].into_iter().filter(|(a, b)| b - a > 1));
     }
-    if turn > LEAST_TURN * n as f64 { triangles } else { Vec::new() }
+    if cosines > LEAST_COSINE * n as f64 { triangles } else { Vec::new() }
 }
 
 /// Patches in their order, each unless an edge of it is an inner edge of one before.
@@ -156,12 +160,6 @@ fn without_shared_edges(patches: Vec<Vec<[u32; 3]>>) -> Vec<[u32; 3]> {
     out
 }
 
-fn cross([a, b, c]: [[f64; 3]; 3]) -> [f64; 3] {
-    let u: [f64; 3] = std::array::from_fn(|k| b[k] - a[k]);
-    let v: [f64; 3] = std::array::from_fn(|k| c[k] - a[k]);
-    [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-}
-
 fn length(v: [f64; 3]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
@@ -173,7 +171,7 @@ fn unit(v: [f64; 3]) -> [f64; 3] {
 
 /// Twice a triangle's area; infinite where it has none.
 fn area(corners: [[f64; 3]; 3]) -> f64 {
-    let double = length(cross(corners));
+    let double = length(normal(corners));
     let longest = (0..3)
         .map(|e| {
             let (p, q) = (corners[e], corners[(e + 1) % 3]);
@@ -241,6 +239,35 @@ mod tests {
         let mesh = Mesh::new(&vertices, &faces).unwrap();
         // It turns by ninety degrees everywhere: as much out of the surface as on.
         assert!(close_holes(mesh, 8).unwrap().is_empty());
+    }
+
+    #[test]
+    fn patches_share_no_edge_and_take_none_that_is_there() {
+        let (first, second, third) =
+            (vec![[0, 1, 2], [0, 2, 3]], vec![[2, 0, 4], [2, 5, 0]], vec![[6, 7, 8], [6, 8, 9]]);
+        let kept = without_shared_edges(vec![first.clone(), second, third.clone()]);
+        assert_eq!(kept, [first, third].concat());
+        // A square whose one diagonal is taken gets the other; with both taken it stays open.
+        let (vertices, faces) = sheet(3, |x, y| (x, y) == (1, 1));
+        let mesh = Mesh::new(&vertices, &faces).unwrap();
+        let rim = &border_loops(&faces, &neighbours(&faces), 4)[0];
+        let diagonals = [edge(rim[0].from, rim[2].from), edge(rim[1].from, rim[3].from)];
+        for taken in diagonals {
+            assert!(patch(mesh, rim, &[taken]).iter().all(|f| (0..3).all(|e| edge(f[e], f[(e + 1) % 3]) != taken)));
+            assert_eq!(patch(mesh, rim, &[taken]).len(), 2);
+        }
+        let mut both = diagonals;
+        both.sort_unstable();
+        assert!(patch(mesh, rim, &both).is_empty());
+    }
+
+    #[test]
+    fn faces_that_are_turned_over_and_endless_rims_do_no_harm() {
+        let (vertices, mut faces) = sheet(6, |x, y| (2..4).contains(&x) && y == 3);
+        faces.iter_mut().step_by(5).for_each(|f| f.swap(0, 1));
+        let mesh = Mesh::new(&vertices, &faces).unwrap();
+        assert!(close_holes(mesh, 1000).is_ok());
+        assert!(close_holes(mesh, 1001).unwrap_err().to_string().starts_with("most_edges:"));
     }
 
     #[test]

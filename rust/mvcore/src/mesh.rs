@@ -39,11 +39,16 @@ impl<'a> Mesh<'a> {
     /// Normal of a face, its length twice the area.
     #[inline(always)]
     pub fn normal(&self, face: usize) -> [f64; 3] {
-        let [a, b, c] = self.corners(face);
-        let u: [f64; 3] = std::array::from_fn(|k| b[k] - a[k]);
-        let v: [f64; 3] = std::array::from_fn(|k| c[k] - a[k]);
-        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        normal(self.corners(face))
     }
+}
+
+/// Normal of a triangle, its length twice the area.
+#[inline(always)]
+pub fn normal([a, b, c]: [[f64; 3]; 3]) -> [f64; 3] {
+    let u: [f64; 3] = std::array::from_fn(|k| b[k] - a[k]);
+    let v: [f64; 3] = std::array::from_fn(|k| c[k] - a[k]);
+    [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
 }
 
 /// Pixel and z-depth of a world point under P = K [R | t] (row-major 3x4).
