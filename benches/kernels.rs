@@ -74,6 +74,7 @@ fn stereo(c: &mut Criterion) {
         prior_weight: 0.1,
         prior_reach: 4.0,
         geometry_weight: 0.0,
+        adjacent: false,
     };
     let prior = vec![0.0; w * h];
     group.throughput(Throughput::Elements((w * h) as u64));

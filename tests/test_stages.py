@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import _core
 from mvcore.config import Config, DepthConfig, SurfaceConfig, VolumeConfig
-from mvcore.depth import View, _speckles, estimate_depth, filter_depth, refine_depth, seeded_depth, sweep_depth
+from mvcore.depth import View, _speckles, estimate_depth, filter_depth, guided_depth, refine_depth, seeded_depth, sweep_depth
 from mvcore.errors import InvalidInputError, ReconstructionError
 from mvcore.io.images import read_image
 from mvcore.sparse import (
@@ -139,6 +139,37 @@ def test_an_expected_surface_seeds_the_depth_and_a_wrong_one_does_no_harm(ring):
     assert share(seeded_depth(views[0], sources, 1.2, 2.6, known, few)) > share(sweep_depth(views[0], sources, 1.2, 2.6, few))
     with pytest.raises(InvalidInputError, match="seed"):
         seeded_depth(views[0], sources, 1.2, 2.6, known[:-1], config)
+
+
+def test_the_surface_of_all_views_mends_a_views_depth_and_a_wrong_one_does_no_harm(ring):
+    cameras, images, depths, masks = ring
+    views = [View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c) for i, c in zip(images, cameras)]
+    sources = [views[j] for j in (10, 11, 1, 2)]
+    rough = sweep_depth(views[0], sources, 1.2, 2.6)
+    alone = refine_depth(views[0], sources, rough, ())
+    h, w = masks[0].shape
+    true = np.where(masks[0], depths[0], 0).astype(np.float32)
+
+    def guided(found, surface):
+        return guided_depth(views[0], sources, DepthMap(found, alone.confidence), rough, surface)
+
+    def error(found):
+        return np.abs(found.depth - depths[0])[masks[0]] / depths[0][masks[0]]
+
+    # A patch that the view took for something else comes back; elsewhere the surface's accuracy is not lost.
+    spoilt = alone.depth.copy()
+    spoilt[h // 2 - 15 : h // 2 + 15, w // 2 - 15 : w // 2 + 15] = 2.4
+    assert (error(DepthMap(spoilt, alone.confidence)) < 0.01).mean() < (error(alone) < 0.01).mean() - 0.05
+    mended = guided(spoilt, true)
+    assert (error(mended) < 0.01).mean() > (error(alone) < 0.01).mean() + 0.02
+    assert np.median(error(mended)) <= np.median(error(alone))
+    # Photographs speak against a surface that stands off, and its absence changes little.
+    for surface in (np.where(masks[0], 2.4, 0).astype(np.float32), np.zeros_like(true)):
+        kept = guided(alone.depth, surface)
+        assert (error(kept) < 0.01).mean() > (error(alone) < 0.01).mean() - 0.03
+    assert (guided(np.zeros_like(true), np.zeros_like(true)).depth == 0).all()
+    with pytest.raises(InvalidInputError, match="surface"):
+        guided(alone.depth, true[:-1])
 
 
 def test_depth_is_looked_for_where_the_mask_wants_it(ring):

@@ -67,6 +67,7 @@ def refine(
     prior_weight: float,
     prior_reach: float,
     geometry_weight: float,
+    adjacent: bool,
 ) -> _F32: ...
 def consistency(
     depth: _F32,

@@ -77,6 +77,10 @@ class DepthConfig:
     """Cost of missing the other views' surfaces by three pixels or more, in units of 1 - ZNCC."""
     geometry_rounds: int = 1
     """Rounds at half the size once the other views' depth is known."""
+    surface_rounds: int = 1
+    """Rounds at full size that start from the surface of all views; 0 leaves the third pass out."""
+    surface_lead: float = 0.05
+    """Cost by which a view's own depth must beat that surface to be kept, in units of 1 - ZNCC: many views speak for the surface."""
     min_views: int = 1
     """Fewest other views that must agree with a depth, at the tightest tolerance."""
     pixel_unit: float = 0.25

@@ -103,6 +103,7 @@ def _refine(
     config: DepthConfig,
     reach: float,
     depths: list[Map] = NO_DEPTHS,
+    adjacent: bool = True,
 ) -> Map:
     return _core.refine(
         scale.greys[0],
@@ -120,6 +121,7 @@ def _refine(
         prior_weight=config.prior_weight,
         prior_reach=reach,
         geometry_weight=config.geometry_weight,
+        adjacent=adjacent,
     )
 
 
@@ -174,7 +176,9 @@ def _refined(
     return _Hypotheses(refined, prior, margin, span, step)
 
 
-def _finer(coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig, depths: list[Map] = NO_DEPTHS) -> _Hypotheses:
+def _finer(
+    coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig, depths: list[Map] = NO_DEPTHS, adjacent: bool = True
+) -> _Hypotheses:
     """The hypotheses on a finer (or the same) scale, refined there."""
     h, w = scale.greys[0].shape
     planes = coarse.planes if coarse.planes.shape[:2] == (h, w) else _upsample(coarse.planes, w, h)
@@ -184,7 +188,7 @@ def _finer(coarse: _Hypotheses, scale: _Scale, rounds: int, config: DepthConfig,
         planes[scale.unwanted] = 0
     # One pixel of parallax is half as much inverse depth on an image twice as large.
     ratio = coarse.prior.shape[1] / w
-    planes = _refine(scale, planes, prior, coarse.span, coarse.step * ratio, rounds, config, config.prior_reach / ratio, depths)
+    planes = _refine(scale, planes, prior, coarse.span, coarse.step * ratio, rounds, config, config.prior_reach / ratio, depths, adjacent)
     return replace(coarse, planes=planes)
 
 
@@ -376,10 +380,58 @@ def refine_depth(
         depths = [_resized(r.depth, grey.shape) for r, grey in zip(rough_sources, half.greys[1:], strict=True)]
         found = _finer(found, half, config.geometry_rounds, config, depths)
     # At full size each view is on its own again: errors that views hand to each other would pass the filter together.
-    found = _finer(found, full, config.rounds, config)
-    h, w = found.planes.shape[:2]
-    planes = np.where(_unexposed(reference)[..., None], np.float32(0), found.planes)
-    return _depth_map(planes, cv2.resize(found.margin, (w, h), interpolation=cv2.INTER_LINEAR))
+    # It would cost a quarter more to try adjacent planes here, and they are the same as often as not.
+    found = _finer(found, full, config.rounds, config, adjacent=False)
+    return _exposed_depth(reference, found.planes, found.margin)
+
+
+SURFACE_MARGIN = 0.25
+"""Margin of the aggregation that agreement with the other views' surface is worth."""
+WINDOW = 5
+"""Pixels a side over which the costs of a depth map and a surface are compared."""
+
+
+def guided_depth(
+    reference: View, sources: Sequence[View], found: DepthMap, rough: RoughDepth, surface: Map, config: DepthConfig | None = None
+) -> DepthMap:
+    """Third pass, at full size: starts from the surface that all views made together, where the photographs do not speak against it.
+
+    The surface averages many views' errors and knows what this view took for something else; matching again from there keeps what both
+    agree on. Where there is no surface the view's own depth stays, and either is refined.
+
+    Parameters
+    ----------
+    found, rough : what `refine_depth` and the first pass gave for the reference view.
+    surface : (h, w) float32 z-depth of the surface in the reference view, 0 = none.
+    """
+    config = config or DepthConfig()
+    require(surface.shape == reference.grey.shape, "surface", f"shape {reference.grey.shape}", surface.shape)
+    scales = _pyramid(reference, sources, config)
+    full, ratio = scales[-1], scales[0].greys[0].shape[1] / reference.grey.shape[1]
+    low, high = span = rough.hypotheses.span
+    step, reach = (high - low) / (config.planes - 1) * ratio, config.prior_reach / ratio
+    mine, theirs = (np.where(d > 0, np.clip(1 / np.maximum(d, 1e-30), low, high), 0).astype(np.float32) for d in (found.depth, surface))
+    shown = theirs > 0
+    joined = np.where(shown, theirs, mine)
+    one, two = _start(mine), _start(joined)
+    # Where they differ by no more than the refinement moves, there is nothing to ask.
+    differ = shown & (mine > 0) & (np.abs(mine - theirs) > 2 * step)
+    asked = np.where(differ, joined, 0)
+    costs = [_refine(full, np.where(differ[..., None], p, 0), asked, span, step, 0, config, reach)[..., 3] for p in (one, two)]
+    gain = np.where(differ, costs[0] - costs[1], 0)
+    lead = config.surface_lead * cv2.blur(differ.astype(np.float32), (WINDOW, WINDOW))
+    taken = shown & (~differ | (cv2.blur(gain, (WINDOW, WINDOW)) > -lead))
+    prior = np.where(taken, theirs, mine)
+    planes = _refine(full, np.where(taken[..., None], two, one), prior, span, step, config.surface_rounds, config, reach, adjacent=False)
+    margin = _resized_smoothly(rough.hypotheses.margin, mine.shape)
+    return _exposed_depth(reference, planes, np.where(taken, np.maximum(margin, SURFACE_MARGIN), margin))
+
+
+def _exposed_depth(reference: View, planes: Map, margin: Map) -> DepthMap:
+    """The depth of planes at full size, but where the picture is black."""
+    h, w = planes.shape[:2]
+    planes = np.where(_unexposed(reference)[..., None], np.float32(0), planes)
+    return _depth_map(planes, _resized_smoothly(margin, (h, w)))
 
 
 UNEXPOSED = 10
@@ -403,6 +455,11 @@ def estimate_depth(reference: View, sources: Sequence[View], near: float, far: f
 def _resized(depth: Map, shape: tuple[int, ...]) -> Map:
     h, w = shape
     return depth if depth.shape == (h, w) else cv2.resize(depth, (w, h), interpolation=cv2.INTER_NEAREST)
+
+
+def _resized_smoothly(values: Map, shape: tuple[int, ...]) -> Map:
+    h, w = shape
+    return values if values.shape == (h, w) else cv2.resize(values, (w, h), interpolation=cv2.INTER_LINEAR)
 
 
 def _depth_map(planes: Map, margin: Map) -> DepthMap:

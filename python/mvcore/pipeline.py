@@ -15,17 +15,18 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from . import _core
 from . import depth as depth_stage
 from . import sparse as sparse_stage
 from .cameras import Calibration, Camera
 from .carve import hull_alone, photo_hull, target_hull, visual_hull
-from .config import CarveConfig, Config, DepthConfig
+from .config import CarveConfig, Config, DepthConfig, SurfaceConfig
 from .depth import View
 from .errors import ReconstructionError, require
 from .io import load
 from .io.images import find_masks, load_frame, load_mask, reduce, undistort
 from .result import Reconstruction
-from .standing import find_standing
+from .standing import Standing, find_standing
 from .surface import Surface, cleaned, drop_cavities, isosurface
 from .texture import Given, texture
 from .types import Bounds, DepthMap, Frame, Image, Report, SparsePoints, Track, no_track
@@ -35,7 +36,7 @@ Masks = list[NDArray[np.uint8]]
 
 
 class _Clock:
-    """CPU and wall seconds a stage, into the report."""
+    """CPU and wall seconds a stage, into the report; what is done twice adds up."""
 
     def __init__(self, report: Report) -> None:
         self.stages: dict[str, dict[str, float]] = {}
@@ -47,10 +48,9 @@ class _Clock:
         try:
             yield
         finally:
-            self.stages[name] = {
-                "wall": round(time.perf_counter() - wall, 3),
-                "cpu": round(time.process_time() - cpu, 3),
-            }
+            spent = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
+            before = self.stages.get(name, {})
+            self.stages[name] = {kind: round(before.get(kind, 0.0) + seconds, 3) for kind, seconds in spent.items()}
 
 
 def _calibration(calib: Calibration | Sequence[Camera] | str | Path) -> Calibration:
@@ -135,8 +135,14 @@ def reconstruct(
     with clock.stage("sparse"):
         plan = make_plan(views, given, config, report, track)
     with clock.stage("depth"):
-        depths = _depths(views, plan, config, track)
-    result = build(views, plan, depths, config, report, track, clock)
+        rough, depths = _depths(views, plan, config, track)
+    draft = None
+    if config.depth.surface_rounds and rough:
+        draft = make_draft(views, plan, depths, config, report, track, clock)
+        with clock.stage("depth"):
+            for n in track(rough, "depth, third pass", len(rough)):
+                depths[n] = third_pass(views, plan, n, depths[n], rough[n], draft.surface, config)
+    result = build(views, plan, depths, config, report, track, clock, draft)
     result.cameras = Calibration(tuple(cameras), calib.source)
     result.report["peak_memory_mib"] = round(_peak_memory() / 2**20)
     return result
@@ -187,6 +193,51 @@ def make_plan(views: Views, given: Bounds | None, config: Config, report: Report
     return Plan(points, box, ranges, sources)
 
 
+@dataclass(frozen=True)
+class Draft:
+    """The surface of the second pass's depth maps, and the silhouettes that complete it, if any were needed."""
+
+    surface: Surface
+    found: Standing | None
+
+
+def make_draft(
+    views: Views,
+    plan: Plan,
+    depths: list[DepthMap | None],
+    config: Config,
+    report: Report,
+    track: Track = no_track,
+    clock: _Clock | None = None,
+) -> Draft:
+    """What all views make together of their depth maps, for the third pass to start from."""
+    clock = clock or _Clock(Report())
+    with clock.stage("consistency"):
+        loose = filter_views(views, plan, depths, config.depth.loosened(), track)
+    found = _standing(views, plan, loose, config, report, clock)
+    with clock.stage("volume"):
+        surface = _isosurface(views, plan, loose, found, config, Report())
+        # Nobody sees it: it is neither closed nor smoothed nor decimated.
+        plain = SurfaceConfig(min_component=config.surface.min_component, close_holes=0)
+        return Draft(cleaned(surface, plain, solid=views.masks is not None), found)
+
+
+def _standing(views: Views, plan: Plan, loose: list[DepthMap | None], config: Config, report: Report, clock: _Clock) -> Standing | None:
+    """Silhouettes where there are no masks and little depth."""
+    if views.masks is not None or not config.standing.enabled:
+        return None
+    with clock.stage("silhouettes"):
+        return find_standing(views.images, views.cameras, loose, plan.box, config.standing, config.carve, report)
+
+
+def _isosurface(views: Views, plan: Plan, loose: list[DepthMap | None], found: Standing | None, config: Config, report: Report) -> Surface:
+    """Surface of the field of depth maps that were filtered for fusion."""
+    if found is None:
+        return isosurface(fuse_views(views, plan, loose, config, report))
+    agreeing = found.agreeing(loose, views.cameras)
+    return drop_cavities(isosurface(fuse_views(views, plan, agreeing, config, report, found.silhouettes)))
+
+
 def build(
     views: Views,
     plan: Plan,
@@ -195,26 +246,27 @@ def build(
     report: Report,
     track: Track = no_track,
     clock: _Clock | None = None,
-    given: Given | None = None,
+    draft: Draft | None = None,
 ) -> Reconstruction:
-    """From depth maps (None where a view has none) to the textured mesh; ``given`` is what an earlier instant settled."""
+    """From depth maps (None where a view has none) to the textured mesh; silhouettes are sought unless a draft did without."""
     clock = clock or _Clock(Report())
     with clock.stage("consistency"):
         filtered = filter_views(views, plan, depths, config.depth, track)
-        fused = filter_views(views, plan, depths, config.depth.loosened(), track)
+        loose = filter_views(views, plan, depths, config.depth.loosened(), track)
         _say_kept(filtered, plan.sources, views.masks is not None, report)
-    found = None
-    if views.masks is None and config.standing.enabled:
-        with clock.stage("silhouettes"):
-            found = find_standing(views.images, views.cameras, fused, plan.box, config.standing, config.carve, report)
-        if found is not None:
-            fused = found.agreeing(fused, views.cameras)
+    found = draft.found if draft else None
+    if draft is None or found is not None:
+        # With what the third pass measured they are found better.
+        said = Report()
+        better = _standing(views, plan, loose, config, said, clock)
+        if better is not None or draft is None:
+            found = better
+            report.values |= said.values
     with clock.stage("volume"):
-        surface = isosurface(fuse_views(views, plan, fused, config, report, found and found.silhouettes))
-        if found is not None:
-            surface = drop_cavities(surface)
-            _say_completed(report)
-    return finish(views, plan, filtered, surface, config, report, track, clock, given)
+        surface = _isosurface(views, plan, loose, found, config, report)
+    if found is not None:
+        _say_completed(report)
+    return finish(views, plan, filtered, surface, config, report, track, clock)
 
 
 def fuse_views(
@@ -304,13 +356,25 @@ def second_pass(views: Views, plan: Plan, n: int, rough: Mapping[int, depth_stag
     return depth_stage.refine_depth(views.view(n), [views.view(j) for j in near], rough[n], [rough[j] for j in near], config.depth)
 
 
-def _depths(views: Views, plan: Plan, config: Config, track: Track) -> list[DepthMap | None]:
+def third_pass(
+    views: Views, plan: Plan, n: int, found: DepthMap | None, rough: depth_stage.RoughDepth, surface: Surface, config: Config
+) -> DepthMap | None:
+    """View ``n``'s depth, started from the surface that all views made."""
+    if found is None:
+        return None
+    camera = views.cameras[n]
+    seen, _ = _core.rasterize(surface.vertices, surface.faces, camera.projection, camera.width, camera.height)
+    return depth_stage.guided_depth(views.view(n), [views.view(j) for j in plan.sources[n]], found, rough, seen, config.depth)
+
+
+def _depths(views: Views, plan: Plan, config: Config, track: Track) -> tuple[dict[int, depth_stage.RoughDepth], list[DepthMap | None]]:
+    """The first and the second pass of the views that have sources."""
     used = [n for n, s in enumerate(plan.sources) if s]
     rough = {n: first_pass(views, plan, n, config) for n in track(used, "depth, first pass", len(used))}
     depths: list[DepthMap | None] = [None] * len(views.images)
     for n in track(used, "depth, second pass", len(used)):
         depths[n] = second_pass(views, plan, n, rough, config)
-    return depths
+    return rough, depths
 
 
 def _nothing(camera: Camera) -> DepthMap:

@@ -90,7 +90,7 @@ pub fn correlate<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (reference, images, maps, depths, backs, init, prior, *, iterations, low, high, step, max_slope, prior_weight, prior_reach, geometry_weight))]
+#[pyo3(signature = (reference, images, maps, depths, backs, init, prior, *, iterations, low, high, step, max_slope, prior_weight, prior_reach, geometry_weight, adjacent))]
 pub fn refine<'py>(
     py: Python<'py>,
     reference: PyReadonlyArray2<'py, u8>,
@@ -108,6 +108,7 @@ pub fn refine<'py>(
     prior_weight: f32,
     prior_reach: f32,
     geometry_weight: f32,
+    adjacent: bool,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let (reference, views) = (raster(&reference, "reference")?, sources(&images, &maps)?);
     let surfaces: Vec<SourceSurface> = rasters(&depths, "depths")?
@@ -118,8 +119,16 @@ pub fn refine<'py>(
     let init: Vec<Hypothesis> =
         slice(&init, "init")?.chunks_exact(4).map(|h| Hypothesis { w: h[0], a: h[1], b: h[2], cost: h[3] }).collect();
     let prior = slice(&prior, "prior")?;
-    let params =
-        RefineParams { iterations, range: (low, high), step, max_slope, prior_weight, prior_reach, geometry_weight };
+    let params = RefineParams {
+        iterations,
+        range: (low, high),
+        step,
+        max_slope,
+        prior_weight,
+        prior_reach,
+        geometry_weight,
+        adjacent,
+    };
     let planes = run(py, || mvcore::slanted::refine(reference, &views, &surfaces, &init, prior, &params))?;
     let flat = planes.into_iter().flat_map(|h| [h.w, h.a, h.b, h.cost]).collect();
     array(py, flat, [reference.height, reference.width, 4])

@@ -56,6 +56,8 @@ pub struct RefineParams {
     pub prior_reach: f32,
     /// Cost of missing the sources' surfaces by [`GEOMETRY_REACH`] pixels or more.
     pub geometry_weight: f32,
+    /// Whether adjacent pixels' planes are tried as well: a solution carried up from half the size has the same ones there.
+    pub adjacent: bool,
 }
 
 /// Pixels of reprojection error at which the geometric cost is at its bound.
@@ -71,6 +73,10 @@ const SPACE_SIGMA: f32 = 4.0;
 const COST_LIMIT: f32 = 1.2;
 /// Cost of a plane that no source sees.
 const UNSEEN: f32 = 1.0;
+/// Steps from a plane at which its cost is measured for the parabola: where it still curves upwards.
+const ASIDE: f32 = 0.4;
+/// Steps a pixel by which slopes are varied.
+const SLOPE_CHANGE: f32 = 0.1;
 /// Most source views; more than enough, and it keeps the costs on the stack.
 const MAX_SOURCES: usize = 16;
 
@@ -100,7 +106,9 @@ pub fn refine(
     let quads: Vec<_> = sources.iter().map(|(image, map)| (Quads::new(*image), *map)).collect();
     let scene = Scene { reference, sources: &quads, surfaces, prior, params, sums: sums_for_this_cpu() };
     let mut now = init.to_vec();
-    scene.each_pixel(&mut now, |_| true, |_, view, h| Hypothesis { cost: scene.cost(view, h), ..h });
+    if params.iterations == 0 {
+        scene.each_pixel(&mut now, |_| true, |_, view, h| Hypothesis { cost: scene.cost(view, h), ..h });
+    }
     for iteration in 0..params.iterations {
         for colour in 0..2 {
             let before = now.clone();
@@ -132,8 +140,8 @@ struct View {
     asked: u32,
 }
 
-/// Neighbours whose planes are tried; all of the other colour of the checkerboard.
-const NEIGHBOURS: [(i32, i32); 8] = [(-1, 0), (1, 0), (0, -1), (0, 1), (-5, 0), (5, 0), (0, -5), (0, 5)];
+/// Neighbours whose planes are tried, the adjacent ones last; all of the other colour of the checkerboard.
+const NEIGHBOURS: [(i32, i32); 8] = [(-5, 0), (5, 0), (0, -5), (0, 5), (-1, 0), (1, 0), (0, -1), (0, 1)];
 
 impl Scene<'_> {
     fn each_pixel(
@@ -182,7 +190,7 @@ impl Scene<'_> {
         View { window, x: x as f32, y: y as f32, mean, variance, prior: self.prior[y * image.width + x], asked: !0 }
     }
 
-    /// Tries the neighbours' planes, then ever smaller changes of the best one.
+    /// Tries the neighbours' planes, then a small change of the best one.
     fn improve(
         &self,
         before: &[Hypothesis],
@@ -191,11 +199,11 @@ impl Scene<'_> {
         mut best: Hypothesis,
         iteration: usize,
     ) -> Hypothesis {
-        view.asked = self.shortlist(view, best);
+        (view.asked, best.cost) = self.shortlist(view, best);
         let view = &*view;
-        best.cost = self.cost(view, best);
         let (w, h) = (self.reference.width as i32, self.reference.height as i32);
-        for (dx, dy) in NEIGHBOURS {
+        let tried = if self.params.adjacent { &NEIGHBOURS[..] } else { &NEIGHBOURS[..4] };
+        for &(dx, dy) in tried {
             let (u, v) = (x as i32 + dx, y as i32 + dy);
             if u < 0 || v < 0 || u >= w || v >= h {
                 continue;
@@ -208,16 +216,19 @@ impl Scene<'_> {
         }
         let mut random = Random::at(x, y, iteration);
         let step = self.params.step;
-        for scale in [1.0, 0.4, 0.15] {
-            let changed = Hypothesis {
-                w: best.w + step * scale * random.signed(),
-                a: best.a + 0.25 * step * scale * random.signed(),
-                b: best.b + 0.25 * step * scale * random.signed(),
-                cost: 0.0,
-            };
-            self.try_plane(view, &mut best, changed);
-        }
+        let (w, a, b) = (self.vertex(view, best), best.a, best.b);
+        let [a, b] = [a, b].map(|slope| slope + SLOPE_CHANGE * step * random.signed());
+        self.try_plane(view, &mut best, Hypothesis { w, a, b, cost: 0.0 });
         best
+    }
+
+    /// Inverse depth at the vertex of the parabola through a plane's cost and those on either side of it.
+    fn vertex(&self, view: &View, plane: Hypothesis) -> f32 {
+        let aside = ASIDE * self.params.step;
+        let [below, above] = [-aside, aside].map(|d| self.cost(view, Hypothesis { w: plane.w + d, ..plane }));
+        let curvature = below - 2.0 * plane.cost + above;
+        let shift = if curvature > 1e-6 { 0.5 * (below - above) / curvature } else { (below - above).signum() };
+        plane.w + aside * shift.clamp(-1.5, 1.5)
     }
 
     fn try_plane(&self, view: &View, best: &mut Hypothesis, mut plane: Hypothesis) {
@@ -230,31 +241,54 @@ impl Scene<'_> {
         if same || plane.w < low || plane.w > high || plane.a.abs() > limit || plane.b.abs() > limit {
             return;
         }
-        plane.cost = self.cost(view, plane);
+        plane.cost = self.cost_below(best.cost, view, plane);
         if plane.cost < best.cost {
             *best = plane;
         }
     }
 
     fn cost(&self, view: &View, plane: Hypothesis) -> f32 {
+        self.cost_below(f32::INFINITY, view, plane)
+    }
+
+    /// A plane's cost; infinity where it is found not to lie below `limit` before the last source is asked.
+    fn cost_below(&self, limit: f32, view: &View, plane: Hypothesis) -> f32 {
         if plane.w == 0.0 {
             return f32::MAX;
         }
-        let mut costs = [0.0; MAX_SOURCES];
-        let mut seen = 0;
-        for n in (0..self.sources.len()).filter(|n| view.asked >> n & 1 == 1) {
+        let pull = self.pull(view, plane);
+        let asked = (0..self.sources.len()).filter(|n| view.asked >> n & 1 == 1);
+        let (mut costs, mut seen, mut left) = ([0.0; MAX_SOURCES], 0, asked.clone().count());
+        for n in asked {
             if let Some(cost) = self.cost_in(n, view, plane) {
                 costs[seen] = cost;
                 seen += 1;
             }
+            left -= 1;
+            // At best the last one costs nothing and takes the place of the greatest.
+            if left == 1 && seen > 0 {
+                let n = self.wanted().min(seen + 1);
+                costs[..seen].sort_unstable_by(f32::total_cmp);
+                if costs[..n - 1].iter().sum::<f32>() / n as f32 + pull >= limit {
+                    return f32::INFINITY;
+                }
+            }
         }
-        let wanted = self.sources.len().div_ceil(2);
-        let photo = if seen == 0 { UNSEEN } else { mean_of_lowest(&mut costs[..seen], wanted.min(seen)) };
+        self.mean_of_best(&mut costs[..seen]) + pull
+    }
+
+    /// Sources of which the mean is taken.
+    fn wanted(&self) -> usize {
+        self.sources.len().div_ceil(2)
+    }
+
+    /// What the prior adds.
+    fn pull(&self, view: &View, plane: Hypothesis) -> f32 {
         if view.prior == 0.0 {
-            return photo;
+            return 0.0;
         }
         let distance = (plane.w - view.prior).abs() / (self.params.step * self.params.prior_reach);
-        photo + self.params.prior_weight * distance.min(1.0)
+        self.params.prior_weight * distance.min(1.0)
     }
 
     /// Cost of a plane in one source; `None` where that does not see it.
@@ -270,25 +304,33 @@ impl Scene<'_> {
         Some(photo + self.params.geometry_weight * missed / GEOMETRY_REACH)
     }
 
-    /// The sources that see the pixel's present plane best: half of them and one more.
-    fn shortlist(&self, view: &View, plane: Hypothesis) -> u32 {
-        let count = self.sources.len();
-        let wanted = count.div_ceil(2) + 1;
-        if wanted >= count {
-            return !0;
+    /// The sources that see the pixel's present plane best, half of them and one more, and the plane's cost.
+    fn shortlist(&self, view: &View, plane: Hypothesis) -> (u32, f32) {
+        if plane.w == 0.0 {
+            return (!0, f32::MAX);
         }
         let mut ranked = [(f32::MAX, 0); MAX_SOURCES];
+        let (count, mut seen) = (self.sources.len(), 0);
         for (n, slot) in ranked[..count].iter_mut().enumerate() {
-            *slot = (self.cost_in(n, view, plane).unwrap_or(f32::MAX), n);
+            let cost = self.cost_in(n, view, plane);
+            seen += usize::from(cost.is_some());
+            *slot = (cost.unwrap_or(f32::MAX), n);
         }
         ranked[..count].sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        ranked[..wanted].iter().fold(0, |bits, (_, n)| bits | 1 << n)
+        let mut costs = ranked.map(|(cost, _)| cost);
+        let cost = self.mean_of_best(&mut costs[..seen]) + self.pull(view, plane);
+        (ranked[..count.min(self.wanted() + 1)].iter().fold(0, |bits, (_, n)| bits | 1 << n), cost)
     }
-}
 
-fn mean_of_lowest(costs: &mut [f32], n: usize) -> f32 {
-    costs.sort_unstable_by(f32::total_cmp);
-    costs[..n].iter().sum::<f32>() / n as f32
+    /// Mean of the lowest costs, as many as are wanted.
+    fn mean_of_best(&self, costs: &mut [f32]) -> f32 {
+        if costs.is_empty() {
+            return UNSEEN;
+        }
+        let n = self.wanted().min(costs.len());
+        costs.sort_unstable_by(f32::total_cmp);
+        costs[..n].iter().sum::<f32>() / n as f32
+    }
 }
 
 /// The window of a pixel with `plane` in a source view, to first order; `None` behind the camera.
@@ -362,6 +404,7 @@ mod tests {
         prior_weight: 0.0,
         prior_reach: 2.0,
         geometry_weight: 0.0,
+        adjacent: true,
     };
 
     /// Smooth texture that can be sampled anywhere.
@@ -395,6 +438,33 @@ mod tests {
         errors.sort_unstable_by(f32::total_cmp);
         assert!(errors[errors.len() / 2] < 0.05, "median {}", errors[errors.len() / 2]);
         assert!(errors[errors.len() * 95 / 100] < 0.3, "95 % {}", errors[errors.len() * 95 / 100]);
+    }
+
+    #[test]
+    fn costs_are_exact_below_the_limit_and_no_less_above_it() {
+        let (w, h) = (40, 30);
+        let images: Vec<Vec<u8>> = (0..5)
+            .map(|n| (0..w * h).map(|i| shade((i % w + 2 * n) as f32, (i / w + n * n) as f32)).collect())
+            .collect();
+        let rasters: Vec<_> = images.iter().map(|i| Raster::new(i, w, h, "image").unwrap()).collect();
+        let quads: Vec<_> = rasters[1..].iter().map(|r| (Quads::new(*r), PAIR)).collect();
+        let prior = vec![3.0; w * h];
+        let params = RefineParams { prior_weight: 0.1, ..PARAMS };
+        let sums = sums_for_this_cpu();
+        let scene =
+            Scene { reference: rasters[0], sources: &quads, surfaces: &[], prior: &prior, params: &params, sums };
+        let view = scene.view(20, 15);
+        let mut stopped = 0;
+        for step in 0..60 {
+            let plane = Hypothesis { w: 0.5 + 0.3 * step as f32, ..Default::default() };
+            let cost = scene.cost(&view, plane);
+            for limit in [0.3, 0.6, 0.9, 1.2] {
+                let found = scene.cost_below(limit, &view, plane);
+                assert!(found == cost || (found == f32::INFINITY && cost >= limit), "{found} for {cost} below {limit}");
+                stopped += usize::from(found == f32::INFINITY);
+            }
+        }
+        assert!(stopped > 20, "{stopped}");
     }
 
     #[test]
