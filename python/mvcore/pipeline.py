@@ -248,20 +248,13 @@ def build(
     clock: _Clock | None = None,
     draft: Draft | None = None,
 ) -> Reconstruction:
-    """From depth maps (None where a view has none) to the textured mesh; silhouettes are sought unless a draft did without."""
+    """From depth maps (None where a view has none) to the textured mesh; a draft's silhouettes serve again, else they are sought."""
     clock = clock or _Clock(Report())
     with clock.stage("consistency"):
         filtered = filter_views(views, plan, depths, config.depth, track)
         loose = filter_views(views, plan, depths, config.depth.loosened(), track)
         _say_kept(filtered, plan.sources, views.masks is not None, report)
-    found = draft.found if draft else None
-    if draft is None or found is not None:
-        # With what the third pass measured they are found better.
-        said = Report()
-        better = _standing(views, plan, loose, config, said, clock)
-        if better is not None or draft is None:
-            found = better
-            report.values |= said.values
+    found = draft.found if draft else _standing(views, plan, loose, config, report, clock)
     with clock.stage("volume"):
         surface = _isosurface(views, plan, loose, found, config, report)
     if found is not None:
