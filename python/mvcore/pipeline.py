@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +201,10 @@ class Draft:
     found: Standing | None
 
 
+DRAFT_VOXEL = 1.4
+"""Voxels of the draft against the final ones: half the time and hardly less to start from."""
+
+
 def make_draft(
     views: Views,
     plan: Plan,
@@ -216,7 +220,9 @@ def make_draft(
         loose = filter_views(views, plan, depths, config.depth.loosened(), track)
     found = _standing(views, plan, loose, config, report, clock)
     with clock.stage("volume"):
-        surface = _isosurface(views, plan, loose, found, config, Report())
+        volume = config.volume
+        wide = replace(volume, footprints=DRAFT_VOXEL * volume.footprints, voxel=volume.voxel and DRAFT_VOXEL * volume.voxel)
+        surface = _isosurface(views, plan, loose, found, replace(config, volume=wide), Report())
         # Nobody sees it: it is neither closed nor smoothed nor decimated.
         plain = SurfaceConfig(min_component=config.surface.min_component, close_holes=0)
         return Draft(cleaned(surface, plain, solid=views.masks is not None), found)
