@@ -402,10 +402,21 @@ def guided_depth(
     Parameters
     ----------
     found, rough : what `refine_depth` and the first pass gave for the reference view.
-    surface : (h, w) float32 z-depth of the surface in the reference view, 0 = none.
+    surface : (h, w) float32 z-depth of the surface in the reference view, world units, 0 = none.
+
+    Returns
+    -------
+    DepthMap
+        (h, w), unfiltered; the rules of `refine_depth` hold.
+
+    Raises
+    ------
+    InvalidInputError
+        ``found`` or ``surface`` is not of the view's size.
     """
     config = config or DepthConfig()
-    require(surface.shape == reference.grey.shape, "surface", f"shape {reference.grey.shape}", surface.shape)
+    for name, values in (("found", found.depth), ("surface", surface)):
+        require(values.shape == reference.grey.shape, name, f"shape {reference.grey.shape}", values.shape)
     scales = _pyramid(reference, sources, config)
     full, ratio = scales[-1], scales[0].greys[0].shape[1] / reference.grey.shape[1]
     low, high = span = rough.hypotheses.span
