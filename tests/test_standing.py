@@ -5,12 +5,13 @@ from dataclasses import replace
 import mvcore
 import numpy as np
 import pytest
+import trimesh
 from conftest import look_at, texture_of
 from mvcore import _core, standing
 from mvcore.cameras import Camera
 from mvcore.config import Config, StandingConfig, VolumeConfig
 from mvcore.standing import Plane, find_standing, ground, widest_gap
-from mvcore.surface import Surface, drop_cavities, extract_surface
+from mvcore.surface import Surface, drop_cavities, drop_unseen, extract_surface
 from mvcore.types import DepthMap, Report
 from mvcore.volume import fuse_tiles
 
@@ -220,6 +221,23 @@ def test_bubbles_are_dropped_and_open_parts_are_not():
     kept = drop_cavities(Surface(vertices, every))
     assert len(kept.faces) == 12 + 11
     assert (kept.vertices == np.concatenate([box, open_])).all()
+
+
+@pytest.mark.parametrize("subdivisions", [4, 6])
+def test_what_no_camera_sees_is_dropped_but_for_a_rim(subdivisions):
+    ball = trimesh.creation.icosphere(subdivisions)
+    surface = Surface(np.array(ball.vertices), np.array(ball.faces, np.uint32))
+    K = [[100, 0, 79.5], [0, 100, 59.5], [0, 0, 1]]
+    # Above the poles, two at a time: what lies near the equator is seen by none of them.
+    above = [Camera(K, np.diag([1, -1, -1]), [x, 0, 4], 160, 120) for x in (-0.3, 0.3)]
+    for reach in (1.0, 4.0):
+        kept = drop_unseen(surface, above, 0.1, reach)
+        middles = kept.vertices[kept.faces].mean(1)
+        # 4 away a ball of radius 1 is seen down to a height of 1 / 4.
+        assert 0.25 - 0.15 * reach - 0.1 < middles[:, 2].min() < 0.25 - 0.05 * reach
+        # Nothing of the seen side is lost, however fine the faces are.
+        assert (kept.vertices[:, 2] > 0.3).sum() == (surface.vertices[:, 2] > 0.3).sum()
+    assert drop_unseen(surface, [Camera(K, np.eye(3), [0, 0, -9], 160, 120)], 0.1, 1.0) is surface
 
 
 def plain_sphere_points() -> np.ndarray:

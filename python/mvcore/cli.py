@@ -64,16 +64,19 @@ def _without(scene: Scene, excluded: list[int] | None) -> tuple[list[Any], list[
     return [scene.frames[n] for n in kept], [scene.calib[n] for n in kept], kept
 
 
-def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: int | None) -> dict[str, Any]:
+def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: int | None, closed: bool = False) -> dict[str, Any]:
     """A configuration from the options that commands share."""
     if max_image_size is not None and max_image_size < 16:
         raise ValueError(f"--max-image-size: expected at least 16, got {max_image_size}")
     settings: dict[str, Any] = {"matcher": matcher, "device": device}
     if max_image_size is not None:
         settings["depth"] = {"max_image_size": max_image_size}
+    surface: dict[str, Any] = {}
     if max_faces is not None:
-        settings["surface"] = {"max_faces": max_faces}
-    return settings
+        surface["max_faces"] = max_faces
+    if closed:
+        surface["unseen_reach"] = None
+    return settings | ({"surface": surface} if surface else {})
 
 
 Matcher = Annotated[str, typer.Option(help="Depth matcher: sgm (classical) or dcnn (with the network).")]
@@ -89,6 +92,7 @@ def reconstruct(
     bounds: Annotated[str | None, typer.Option(help="Box of the target: x0,y0,z0,x1,y1,z1.")] = None,
     max_image_size: Annotated[int | None, typer.Option(help="Reduce images to this many pixels on the longer side.")] = None,
     max_faces: Annotated[int | None, typer.Option(help="Decimate the mesh to this many faces.")] = None,
+    closed: Annotated[bool, typer.Option("--closed", help="With masks: keep the sides that no photograph shows.")] = False,
     report: Annotated[Path | None, typer.Option(help="Write figures and warnings as JSON.")] = None,
     save_depth: Annotated[Path | None, typer.Option(help="Folder for the depth maps.")] = None,
     matcher: Matcher = "sgm",
@@ -104,7 +108,7 @@ def reconstruct(
 
         if output.suffix.lower() not in FORMATS:
             raise ValueError(f"--output: expected a name ending in {', '.join(FORMATS)}, got {str(output)!r}")
-        settings = _settings(matcher, device, max_image_size, max_faces)
+        settings = _settings(matcher, device, max_image_size, max_faces, closed)
         scene = load(path)
         frames, cameras, kept = _without(scene, _numbers("--exclude", exclude, kind=int))
         box = _numbers("--bounds", bounds, 6)

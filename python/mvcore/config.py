@@ -201,6 +201,9 @@ class SurfaceConfig:
     """Parts with a smaller share of the faces than this, relative to the largest, are dropped."""
     close_holes: int = 120
     """Holes of at most this many edges (of somewhat less than a voxel) are closed where they lie in the surface; 0 leaves them all."""
+    unseen_reach: float | None = 1.0
+    """With silhouettes: voxels from what a photograph shows beyond which the hull's other sides are left open: there it is a bound and no
+    measurement. None keeps them, and with them a closed surface."""
     smooth: int = 0
     """Rounds of Taubin smoothing: rounds off noise without shrinking."""
     max_faces: int | None = None

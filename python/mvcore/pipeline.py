@@ -27,7 +27,7 @@ from .io import load
 from .io.images import find_masks, load_frame, load_mask, reduce, undistort
 from .result import Reconstruction
 from .standing import Standing, find_standing
-from .surface import Surface, cleaned, drop_cavities, isosurface
+from .surface import Surface, cleaned, drop_cavities, drop_unseen, isosurface
 from .texture import Given, texture
 from .types import Bounds, DepthMap, Frame, Image, Report, SparsePoints, Track, no_track
 from .volume import Volume, Window, fuse_tiles
@@ -202,7 +202,7 @@ class Draft:
 
 
 DRAFT_VOXEL = 1.4
-"""Voxels of the draft against the final ones: half the time and hardly less to start from."""
+"""Voxels of the draft against the final ones where there are no masks: half the time in a field that holds all that is in view."""
 
 
 def make_draft(
@@ -220,8 +220,8 @@ def make_draft(
         loose = filter_views(views, plan, depths, config.depth.loosened(), track)
     found = _standing(views, plan, loose, config, report, clock)
     with clock.stage("volume"):
-        volume = config.volume
-        wide = replace(volume, footprints=DRAFT_VOXEL * volume.footprints, voxel=volume.voxel and DRAFT_VOXEL * volume.voxel)
+        volume, times = config.volume, DRAFT_VOXEL if views.masks is None else 1.0
+        wide = replace(volume, footprints=times * volume.footprints, voxel=volume.voxel and times * volume.voxel)
         surface = _isosurface(views, plan, loose, found, replace(config, volume=wide), Report())
         # Nobody sees it: it is neither closed nor smoothed nor decimated.
         plain = SurfaceConfig(min_component=config.surface.min_component, close_holes=0)
@@ -265,6 +265,7 @@ def build(
         surface = _isosurface(views, plan, loose, found, config, report)
     if found is not None:
         _say_completed(report)
+        surface = _shown(views, surface, config, report)
     return finish(views, plan, filtered, surface, config, report, track, clock)
 
 
@@ -286,6 +287,16 @@ def fuse_views(
     yield from fuse_tiles(maps, views.cameras, plan.box, views.masks, settings, report, views.windows, found)
 
 
+def _shown(views: Views, surface: Surface, config: Config, report: Report) -> Surface:
+    """A surface that silhouettes bound, without the sides that no photograph shows; the report knows the field's voxel."""
+    reach = config.surface.unseen_reach
+    if reach is None:
+        return surface
+    kept = drop_unseen(surface, views.cameras, report.values["volume"]["voxel"], reach)
+    report.values["unseen_left_open"] = len(surface.faces) - len(kept.faces)
+    return kept
+
+
 def finish(
     views: Views,
     plan: Plan,
@@ -300,6 +311,8 @@ def finish(
     """From the isosurface found in the field to the textured mesh; the report knows the field's voxel."""
     clock = clock or _Clock(Report())
     with clock.stage("surface"):
+        if views.masks is not None and any(plan.sources):
+            found = _shown(views, found, config, report)
         surface = cleaned(found, config.surface, solid=views.masks is not None)
     with clock.stage("texture"):
         voxel = report.values["volume"]["voxel"]

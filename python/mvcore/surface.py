@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _core
+from .cameras import Camera
 from .config import SurfaceConfig
 from .errors import ReconstructionError, require
 from .volume import SIDE, Volume
@@ -159,6 +160,29 @@ def _at_border(faces: Faces) -> NDArray[np.bool_]:
     border = np.zeros(len(faces), bool)
     border[first[count == 1] // 3] = True
     return border
+
+
+def drop_unseen(surface: Surface, cameras: Sequence[Camera], voxel: float, reach: float) -> Surface:
+    """Drops faces that no camera sees and that lie farther than ``reach`` voxels from all that one sees.
+
+    Where silhouettes bound a surface, nothing else says where it runs on the sides that no photograph shows. All of it stays if nothing
+    is seen at all.
+    """
+    seen = np.zeros(len(surface.vertices), bool)
+    least = 0.0
+    for camera in cameras:
+        depth, face = _core.rasterize(surface.vertices, surface.faces, camera.projection, camera.width, camera.height)
+        hit = face >= 0
+        if hit.any():
+            seen[surface.faces[face[hit]]] = True
+            least = max(least, float(np.median(depth[hit])) / camera.K[0, 0])
+    if not seen.any() or seen.all():
+        return surface
+    # Faces finer than pixels may lie between the rays.
+    within = max(reach * voxel, 1.5 * least)
+    distance, _ = _core.nearest(surface.vertices[~seen], surface.vertices[seen], within)
+    seen[~seen] = np.isfinite(distance)
+    return compact(surface.vertices, surface.faces[seen[surface.faces].any(1)])
 
 
 def smooth(surface: Surface, rounds: int) -> Surface:
