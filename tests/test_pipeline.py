@@ -38,6 +38,18 @@ def test_without_masks_too(ring):
     assert found.bounds.tolist() == [[-0.7] * 3, [0.7] * 3]
 
 
+def test_sides_that_no_photograph_shows_are_left_open_unless_asked_for(ring):
+    cameras, images, _, masks = (part[:5] for part in ring)
+    meshes = {}
+    for reach in (None, 1.0):
+        found = mvcore.reconstruct(images, cameras, masks=masks, config=SETTINGS | {"surface": {"unseen_reach": reach}})
+        meshes[reach] = trimesh.Trimesh(found.vertices, found.faces)  # joins the vertices that charts split
+        assert (found.report.get("unseen_left_open", 0) > 0) == (reach is not None)
+    assert meshes[None].is_watertight
+    assert not meshes[1.0].is_watertight
+    assert meshes[1.0].area < 0.9 * meshes[None].area
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
 def test_saved_meshes_are_read_back(result, tmp_path, suffix):
     path = tmp_path / f"ball{suffix}"
@@ -164,11 +176,12 @@ def test_commands(ring, tmp_path):
         cv2.imwrite(str(folder / "masks" / f"{n:03d}.png"), (m * 255).astype(np.uint8))
     run = CliRunner().invoke
     out = run(app, ["reconstruct", str(folder), "-o", str(tmp_path / "a.glb"), "--exclude", "3", "--masks", str(folder / "masks"),
-                    "--report", str(tmp_path / "r.json"), "--save-depth", str(tmp_path / "d")])  # fmt: skip
+                    "--report", str(tmp_path / "r.json"), "--save-depth", str(tmp_path / "d"), "--closed"])  # fmt: skip
     assert out.exit_code == 0, out.output
     report = json.loads((tmp_path / "r.json").read_text())
     assert 3 not in report["view_numbers"]
     assert report["peak_memory_mib"] > 0
+    assert report["config"]["surface"]["unseen_reach"] is None
     assert (tmp_path / "a.glb").stat().st_size > 10_000
     out = run(app, ["info", str(folder)])
     assert out.exit_code == 0

@@ -228,12 +228,11 @@ def test_what_no_camera_sees_is_dropped_but_for_a_rim(subdivisions):
     ball = trimesh.creation.icosphere(subdivisions)
     surface = Surface(np.array(ball.vertices), np.array(ball.faces, np.uint32))
     K = [[100, 0, 79.5], [0, 100, 59.5], [0, 0, 1]]
-    # Above the poles, two at a time: what lies near the equator is seen by none of them.
+    # Both look down from 4 above the middle: what lies lower than 1 / 4 is seen by neither.
     above = [Camera(K, np.diag([1, -1, -1]), [x, 0, 4], 160, 120) for x in (-0.3, 0.3)]
     for reach in (1.0, 4.0):
         kept = drop_unseen(surface, above, 0.1, reach)
         middles = kept.vertices[kept.faces].mean(1)
-        # 4 away a ball of radius 1 is seen down to a height of 1 / 4.
         assert 0.25 - 0.15 * reach - 0.1 < middles[:, 2].min() < 0.25 - 0.05 * reach
         # Nothing of the seen side is lost, however fine the faces are.
         assert (kept.vertices[:, 2] > 0.3).sum() == (surface.vertices[:, 2] > 0.3).sum()

@@ -64,7 +64,7 @@ def _without(scene: Scene, excluded: list[int] | None) -> tuple[list[Any], list[
     return [scene.frames[n] for n in kept], [scene.calib[n] for n in kept], kept
 
 
-def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: int | None, closed: bool = False) -> dict[str, Any]:
+def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: int | None, closed: bool) -> dict[str, Any]:
     """A configuration from the options that commands share."""
     if max_image_size is not None and max_image_size < 16:
         raise ValueError(f"--max-image-size: expected at least 16, got {max_image_size}")
@@ -80,6 +80,7 @@ def _settings(matcher: str, device: str, max_image_size: int | None, max_faces: 
 
 
 Matcher = Annotated[str, typer.Option(help="Depth matcher: sgm (classical) or dcnn (with the network).")]
+Closed = Annotated[bool, typer.Option("--closed", help="Keep the sides that silhouettes bound but no photograph shows.")]
 Device = Annotated[str, typer.Option(help="Where the network runs: cpu or cuda.")]
 
 
@@ -92,7 +93,7 @@ def reconstruct(
     bounds: Annotated[str | None, typer.Option(help="Box of the target: x0,y0,z0,x1,y1,z1.")] = None,
     max_image_size: Annotated[int | None, typer.Option(help="Reduce images to this many pixels on the longer side.")] = None,
     max_faces: Annotated[int | None, typer.Option(help="Decimate the mesh to this many faces.")] = None,
-    closed: Annotated[bool, typer.Option("--closed", help="With masks: keep the sides that no photograph shows.")] = False,
+    closed: Closed = False,
     report: Annotated[Path | None, typer.Option(help="Write figures and warnings as JSON.")] = None,
     save_depth: Annotated[Path | None, typer.Option(help="Folder for the depth maps.")] = None,
     matcher: Matcher = "sgm",
@@ -148,6 +149,7 @@ def video(
     workdir: Annotated[Path | None, typer.Option(help="Keeps results; an interrupted run goes on there.")] = None,
     max_image_size: Annotated[int | None, typer.Option(help="Reduce images to this many pixels on the longer side.")] = None,
     max_faces: Annotated[int | None, typer.Option(help="Decimate each mesh to this many faces.")] = None,
+    closed: Closed = False,
     matcher: Matcher = "sgm",
     device: Device = "cpu",
     debug: Debug = False,
@@ -159,7 +161,7 @@ def video(
         from .video import reconstruct_video
 
         clips = load_video(path, calib, start=start, stop=stop, stride=stride)
-        settings = _settings(matcher, device, max_image_size, max_faces)
+        settings = _settings(matcher, device, max_image_size, max_faces, closed)
         if scheduler is not None and workdir is None:
             workdir = output / "work"  # a temporary folder would be this machine's alone
         names = [c.name for c in clips.clips]

@@ -265,8 +265,7 @@ def build(
         surface = _isosurface(views, plan, loose, found, config, report)
     if found is not None:
         _say_completed(report)
-        surface = _shown(views, surface, config, report)
-    return finish(views, plan, filtered, surface, config, report, track, clock)
+    return finish(views, plan, filtered, surface, config, report, track, clock, completed=found is not None)
 
 
 def fuse_views(
@@ -307,11 +306,16 @@ def finish(
     track: Track = no_track,
     clock: _Clock | None = None,
     given: Given | None = None,
+    completed: bool = False,
 ) -> Reconstruction:
-    """From the isosurface found in the field to the textured mesh; the report knows the field's voxel."""
+    """From the isosurface found in the field to the textured mesh; the report knows the field's voxel.
+
+    ``completed`` says that silhouettes found without masks bound the surface as well.
+    """
     clock = clock or _Clock(Report())
     with clock.stage("surface"):
-        if views.masks is not None and any(plan.sources):
+        # A hull alone has nothing measured beside which its other sides would be guesses.
+        if completed or (views.masks is not None and any(plan.sources)):
             found = _shown(views, found, config, report)
         surface = cleaned(found, config.surface, solid=views.masks is not None)
     with clock.stage("texture"):

@@ -167,6 +167,11 @@ def drop_unseen(surface: Surface, cameras: Sequence[Camera], voxel: float, reach
 
     Where silhouettes bound a surface, nothing else says where it runs on the sides that no photograph shows. All of it stays if nothing
     is seen at all.
+
+    Parameters
+    ----------
+    voxel : scale of the surface's detail, world units.
+    reach : voxels; never less than one and a half pixel footprints, for faces finer than pixels lie between their rays.
     """
     seen = np.zeros(len(surface.vertices), bool)
     least = 0.0
@@ -178,7 +183,6 @@ def drop_unseen(surface: Surface, cameras: Sequence[Camera], voxel: float, reach
             least = max(least, float(np.median(depth[hit])) / camera.K[0, 0])
     if not seen.any() or seen.all():
         return surface
-    # Faces finer than pixels may lie between the rays.
     within = max(reach * voxel, 1.5 * least)
     distance, _ = _core.nearest(surface.vertices[~seen], surface.vertices[seen], within)
     seen[~seen] = np.isfinite(distance)
