@@ -49,6 +49,18 @@ impl Quads {
         Self { words, width: w, height: h }
     }
 
+    /// The words, row-major, one a pixel.
+    #[inline(always)]
+    pub fn words(&self) -> &[u32] {
+        &self.words
+    }
+
+    /// Columns and rows.
+    #[inline(always)]
+    pub fn size(&self) -> (usize, usize) {
+        (self.width, self.height)
+    }
+
     /// Whether the position lies on the image.
     #[inline(always)]
     pub fn sees(&self, u: f32, v: f32) -> bool {

@@ -11,6 +11,7 @@
 //! Collins (CVPR 1996), best half after Kang, Szeliski and Chai (CVPR 2001).
 
 use crate::error::{Result, require};
+use crate::patch::Quads;
 use crate::raster::{Epipolar, Raster};
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -46,9 +47,10 @@ pub fn sweep(
     require(planes.iter().all(|w| w.is_finite()), "planes", "finite inverse depths", "NaN or infinity")?;
     let best = if best == 0 { sources.len().div_ceil(2) } else { best.min(sources.len()) };
     let (w, h, d) = (reference.width, reference.height, planes.len());
+    let sources: Vec<_> = sources.iter().map(|(image, map)| (Quads::new(*image), *map)).collect();
     let mut costs = vec![0u8; w * h * d];
     costs.par_chunks_mut(BAND * w * d).enumerate().for_each(|(i, out)| {
-        sweep_band(reference, sources, planes, best, i * BAND, out);
+        sweep_band(reference, &sources, planes, best, i * BAND, out);
     });
     Ok(costs)
 }
@@ -95,7 +97,7 @@ const OFFSETS: [(i32, i32); 40] = {
 ))]
 fn sweep_band(
     reference: Raster<u8>,
-    sources: &[(Raster<u8>, Epipolar)],
+    sources: &[(Quads, Epipolar)],
     planes: &[f32],
     best: usize,
     y0: usize,
@@ -111,27 +113,21 @@ fn sweep_band(
     let mut cost = vec![0u8; w * rows];
     let mut lowest = vec![INVALID; best * w * rows];
     let mut scratch = Sums::new(w);
+    let mut taps = Taps::new(warped.stride);
     for (plane, &inverse_depth) in planes.iter().enumerate() {
         lowest.fill(INVALID);
         for (source, map) in sources {
-            warp(*source, map, inverse_depth, y0 as f32, w, rows, &mut warped, &mut valid);
+            warp(source, map, inverse_depth, y0 as f32, w, rows, &mut taps, &mut warped, &mut valid);
             census_cost(&warped, &signs, w, rows, &mut cost);
             add_zncc(&strip, &warped, &moments, w, rows, &mut scratch, &mut cost);
             for (c, &v) in cost.iter_mut().zip(&valid) {
                 *c |= v; // 255 where the source does not see the plane
             }
-            keep_lowest(&cost, &mut lowest, best);
+            keep_lowest(&mut cost, &mut lowest);
         }
-        for i in 0..w * rows {
-            let (mut sum, mut n) = (0u32, 0u32);
-            for k in 0..best {
-                let c = lowest[k * w * rows + i];
-                if c != INVALID {
-                    sum += u32::from(c);
-                    n += 1;
-                }
-            }
-            out[i * d + plane] = (sum + n / 2).checked_div(n).map_or(UNSEEN, |mean| mean as u8);
+        mean_of_kept(&lowest, &mut cost);
+        for (line, &c) in out.chunks_exact_mut(d).zip(&cost) {
+            line[plane] = c;
         }
     }
 }
@@ -294,70 +290,114 @@ fn add_zncc(
             let variance = (ss as f32 * (1.0 / PATCH) - m * m).max(0.0) + NOISE_VARIANCE;
             let covariance = rs as f32 * (1.0 / PATCH) - m * mean[x];
             let zncc = covariance * inverse[x] / variance.sqrt();
-            line[x] += ((1.0 - zncc).min(1.0) * ZNCC_SCALE).max(0.0) as u8;
+            line[x] += whole(((1.0 - zncc).min(1.0) * ZNCC_SCALE).max(0.0)) as u8;
         }
     }
 }
 
-/// Keeps, per pixel, the `best` lowest costs seen so far in ascending order.
+/// Keeps, per pixel, the lowest costs seen so far in ascending order; `lowest` holds one map after the other. `cost` is used up.
 #[inline(always)]
-fn keep_lowest(cost: &[u8], lowest: &mut [u8], best: usize) {
-    let n = cost.len();
-    for i in 0..n {
-        let mut c = cost[i];
-        for k in 0..best {
-            let held = lowest[k * n + i];
-            lowest[k * n + i] = held.min(c);
-            c = held.max(c);
+fn keep_lowest(cost: &mut [u8], lowest: &mut [u8]) {
+    for held in lowest.chunks_exact_mut(cost.len()) {
+        for (c, held) in cost.iter_mut().zip(held) {
+            (*held, *c) = ((*held).min(*c), (*held).max(*c));
         }
+    }
+}
+
+/// Mean of the costs kept, rounded; [`UNSEEN`] where there is none.
+#[inline(always)]
+fn mean_of_kept(lowest: &[u8], mean: &mut [u8]) {
+    let pixels = mean.len();
+    for (i, mean) in mean.iter_mut().enumerate() {
+        let (mut sum, mut n) = (0u16, 0u16);
+        for kept in lowest.chunks_exact(pixels) {
+            let seen = u16::from(kept[i] != INVALID);
+            sum += seen * u16::from(kept[i]);
+            n += seen;
+        }
+        // Exact: a quotient of so small numbers is never rounded up to the next whole one.
+        let rounded = f32::from(sum + n / 2) / f32::from(n.max(1));
+        *mean = if n == 0 { UNSEEN } else { whole(rounded) as u8 };
+    }
+}
+
+/// The whole part of a value from 0 to 2^23, at the speed of an addition: a cast that saturates is not vectorised.
+#[inline(always)]
+fn whole(value: f32) -> u32 {
+    const INTEGERS: f32 = (1 << 23) as f32; // the next float is 1 away
+    (value.floor() + INTEGERS).to_bits() & ((1 << 23) - 1)
+}
+
+/// Where a line's samples fall: the words of their 2x2 pixels and the place between those, in 1/128 pixel steps.
+struct Taps {
+    index: Vec<u32>,
+    right: Vec<u32>,
+    down: Vec<u32>,
+    words: Vec<u32>,
+}
+
+impl Taps {
+    fn new(n: usize) -> Self {
+        Self { index: vec![0; n], right: vec![0; n], down: vec![0; n], words: vec![0; n] }
     }
 }
 
 /// Samples `source` at the plane `inverse_depth` for every pixel of the strip; `valid` is 255 where it does not see it.
 #[inline(always)]
 fn warp(
-    source: Raster<u8>,
+    source: &Quads,
     map: &Epipolar,
     inverse_depth: f32,
     y0: f32,
     w: usize,
     rows: usize,
+    taps: &mut Taps,
     out: &mut Strip,
     valid: &mut [u8],
 ) {
     let m = &map.matrix;
     let o = map.offset.map(|v| v * inverse_depth);
-    let (x_max, y_max) = ((source.width - 1) as f32, (source.height - 1) as f32);
-    let stride = out.stride;
+    let (width, height) = source.size();
+    let (x_max, y_max) = ((width - 1) as f32, (height - 1) as f32);
+    let (stride, width) = (out.stride, width as u32);
+    let (index, right, down) = (&mut taps.index[..stride], &mut taps.right[..stride], &mut taps.down[..stride]);
+    let words = &mut taps.words[..stride];
     for r in 0..rows + 2 * HALO {
         let y = y0 + r as f32 - HALO as f32;
         let base = [m[1] * y + m[2] + o[0], m[4] * y + m[5] + o[1], m[7] * y + m[8] + o[2]];
-        let line = &mut out.data[r * stride..(r + 1) * stride];
-        let inner = r >= HALO && r < HALO + rows;
-        for (i, v) in line.iter_mut().enumerate() {
+        let at = |i: usize| {
             let x = i as f32 - HALO as f32;
             let z = m[6] * x + base[2];
             let scale = 1.0 / z.max(1e-12);
-            let (u, t) = ((m[0] * x + base[0]) * scale, (m[3] * x + base[1]) * scale);
-            if inner && i >= HALO && i < HALO + w {
-                let seen = z > 0.0 && u >= -0.5 && t >= -0.5 && u <= x_max + 0.5 && t <= y_max + 0.5;
-                valid[(r - HALO) * w + i - HALO] = if seen { 0 } else { INVALID };
+            (z, (m[0] * x + base[0]) * scale, (m[3] * x + base[1]) * scale)
+        };
+        for i in 0..stride {
+            let (_, u, t) = at(i);
+            let (u, t) = (u.max(0.0).min(x_max), t.max(0.0).min(y_max)); // 0 for NaN
+            let (x, y) = (u.floor(), t.floor());
+            index[i] = whole(y) * width + whole(x);
+            right[i] = whole((u - x) * 128.0);
+            down[i] = whole((t - y) * 128.0);
+        }
+        if r >= HALO && r < HALO + rows {
+            for (i, v) in valid[(r - HALO) * w..][..w].iter_mut().enumerate() {
+                let (z, u, t) = at(i + HALO);
+                let seen = (z > 0.0) & (u >= -0.5) & (t >= -0.5) & (u <= x_max + 0.5) & (t <= y_max + 0.5);
+                *v = if seen { 0 } else { INVALID };
             }
-            *v = bilinear(source, u.clamp(0.0, x_max), t.clamp(0.0, y_max));
+        }
+        for (word, &i) in words.iter_mut().zip(&*index) {
+            *word = source.words()[i as usize];
+        }
+        let line = &mut out.data[r * stride..(r + 1) * stride];
+        for i in 0..stride {
+            let (a, b, q) = (right[i], down[i], words[i]);
+            let top = (q & 255) * (128 - a) + (q >> 8 & 255) * a;
+            let bottom = (q >> 16 & 255) * (128 - a) + (q >> 24) * a;
+            line[i] = ((top * (128 - b) + bottom * b + (1 << 13)) >> 14) as u8;
         }
     }
-}
-
-/// Bilinear sample at a position inside the raster, in 1/128 pixel steps.
-#[inline(always)]
-fn bilinear(image: Raster<u8>, u: f32, v: f32) -> u8 {
-    let (x, y) = (u as usize, v as usize);
-    let (a, b) = (((u - x as f32) * 128.0) as u32, ((v - y as f32) * 128.0) as u32);
-    let (x1, y1) = ((x + 1).min(image.width - 1), (y + 1).min(image.height - 1));
-    let at = |x: usize, y: usize| u32::from(image.data[y * image.width + x]);
-    let top = at(x, y) * (128 - a) + at(x1, y) * a;
-    let bottom = at(x, y1) * (128 - a) + at(x1, y1) * a;
-    ((top * (128 - b) + bottom * b + (1 << 13)) >> 14) as u8
 }
 
 #[cfg(test)]
