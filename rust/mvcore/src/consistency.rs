@@ -100,7 +100,8 @@ fn round_trip(x: f32, y: f32, z: f32, other: &OtherView) -> Option<Trip> {
     let (u, v, expected) = project(&other.there, x, y, z)?;
     let there = sample(&other.depth, u, v)?;
     let (bx, by, depth) = project(&other.back, u, v, there)?;
-    Some(Trip { pixels: (bx - x).hypot(by - y), depth, hidden: there < expected * (1.0 - HIDING) })
+    let (dx, dy) = (bx - x, by - y);
+    Some(Trip { pixels: (dx * dx + dy * dy).sqrt(), depth, hidden: there < expected * (1.0 - HIDING) })
 }
 
 fn project(map: &Epipolar, x: f32, y: f32, z: f32) -> Option<(f32, f32, f32)> {

@@ -81,7 +81,7 @@ const SLOPE_CHANGE: f32 = 0.1;
 const MAX_SOURCES: usize = 16;
 
 /// Improves the planes of `init` (h·w, row-major) in place of a copy; `prior` holds inverse depths, 0 where there is none. A pixel
-/// with neither is left alone.
+/// without a plane starts from its prior; with neither it is left alone.
 pub fn refine(
     reference: Raster<u8>,
     sources: &[(Raster<u8>, Epipolar)],
@@ -107,7 +107,7 @@ pub fn refine(
     let scene = Scene { reference, sources: &quads, surfaces, prior, params, sums: sums_for_this_cpu() };
     let mut now = init.to_vec();
     if params.iterations == 0 {
-        scene.each_pixel(&mut now, |_| true, |_, view, h| Hypothesis { cost: scene.cost(view, h), ..h });
+        scene.each_pixel(&mut now, |_| true, |_, view, h| Hypothesis { cost: scene.shortlist(view, h).1, ..h });
     }
     for iteration in 0..params.iterations {
         for colour in 0..2 {
@@ -136,8 +136,8 @@ struct View {
     mean: f32,
     variance: f32,
     prior: f32,
-    /// Sources asked, as bits.
-    asked: u32,
+    /// The sources asked: the first `asked.1` of `asked.0`.
+    asked: ([u8; MAX_SOURCES], usize),
 }
 
 /// Neighbours whose planes are tried, the adjacent ones last; all of the other colour of the checkerboard.
@@ -153,7 +153,10 @@ impl Scene<'_> {
         let width = self.reference.width;
         planes.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
             for (x, h) in row.iter_mut().enumerate().filter(|(x, _)| chosen((*x, y))) {
-                if h.w == 0.0 && self.prior[y * width + x] == 0.0 {
+                if h.w == 0.0 {
+                    *h = Hypothesis { w: self.prior[y * width + x], ..Default::default() };
+                }
+                if h.w == 0.0 {
                     continue;
                 }
                 let mut view = self.view(x, y);
@@ -187,7 +190,15 @@ impl Scene<'_> {
             square += window.weighted[i] * grey;
         }
         let variance = (square - mean * mean).max(0.0) + NOISE_VARIANCE;
-        View { window, x: x as f32, y: y as f32, mean, variance, prior: self.prior[y * image.width + x], asked: !0 }
+        View {
+            window,
+            x: x as f32,
+            y: y as f32,
+            mean,
+            variance,
+            prior: self.prior[y * image.width + x],
+            asked: ([0; MAX_SOURCES], 0),
+        }
     }
 
     /// Tries the neighbours' planes, then a small change of the best one.
@@ -253,28 +264,19 @@ impl Scene<'_> {
 
     /// A plane's cost; infinity where it is found not to lie below `limit` before the last source is asked.
     fn cost_below(&self, limit: f32, view: &View, plane: Hypothesis) -> f32 {
-        if plane.w == 0.0 {
-            return f32::MAX;
-        }
         let pull = self.pull(view, plane);
-        let asked = (0..self.sources.len()).filter(|n| view.asked >> n & 1 == 1);
-        let (mut costs, mut seen, mut left) = ([0.0; MAX_SOURCES], 0, asked.clone().count());
-        for n in asked {
-            if let Some(cost) = self.cost_in(n, view, plane) {
-                costs[seen] = cost;
-                seen += 1;
-            }
-            left -= 1;
-            // At best the last one costs nothing and takes the place of the greatest.
-            if left == 1 && seen > 0 {
-                let n = self.wanted().min(seen + 1);
-                costs[..seen].sort_unstable_by(f32::total_cmp);
-                if costs[..n - 1].iter().sum::<f32>() / n as f32 + pull >= limit {
-                    return f32::INFINITY;
-                }
-            }
+        let Some((&last, first)) = view.asked.0[..view.asked.1].split_last() else { return UNSEEN + pull };
+        let mut kept = Lowest { wanted: self.wanted(), ..Default::default() };
+        for &n in first {
+            kept.add(self.cost_in(n.into(), view, plane));
         }
-        self.mean_of_best(&mut costs[..seen]) + pull
+        // At best the last one costs nothing and takes the place of the greatest.
+        let least = Lowest { seen: kept.seen + 1, ..kept };
+        if least.mean() + pull >= limit {
+            return f32::INFINITY;
+        }
+        kept.add(self.cost_in(last.into(), view, plane));
+        kept.mean() + pull
     }
 
     /// Sources of which the mean is taken.
@@ -305,31 +307,46 @@ impl Scene<'_> {
     }
 
     /// The sources that see the pixel's present plane best, half of them and one more, and the plane's cost.
-    fn shortlist(&self, view: &View, plane: Hypothesis) -> (u32, f32) {
-        if plane.w == 0.0 {
-            return (!0, f32::MAX);
-        }
+    fn shortlist(&self, view: &View, plane: Hypothesis) -> (([u8; MAX_SOURCES], usize), f32) {
         let mut ranked = [(f32::MAX, 0); MAX_SOURCES];
-        let (count, mut seen) = (self.sources.len(), 0);
+        let count = self.sources.len();
         for (n, slot) in ranked[..count].iter_mut().enumerate() {
-            let cost = self.cost_in(n, view, plane);
-            seen += usize::from(cost.is_some());
-            *slot = (cost.unwrap_or(f32::MAX), n);
+            *slot = (self.cost_in(n, view, plane).unwrap_or(f32::MAX), n as u8);
         }
         ranked[..count].sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let mut costs = ranked.map(|(cost, _)| cost);
-        let cost = self.mean_of_best(&mut costs[..seen]) + self.pull(view, plane);
-        (ranked[..count.min(self.wanted() + 1)].iter().fold(0, |bits, (_, n)| bits | 1 << n), cost)
+        let mut kept = Lowest { wanted: self.wanted(), ..Default::default() };
+        for (cost, _) in &ranked[..kept.wanted] {
+            kept.add((*cost < f32::MAX).then_some(*cost));
+        }
+        ((ranked.map(|(_, n)| n), count.min(kept.wanted + 1)), kept.mean() + self.pull(view, plane))
+    }
+}
+
+/// The lowest `wanted` costs among no more than one more than these.
+#[derive(Debug, Clone, Copy, Default)]
+struct Lowest {
+    wanted: usize,
+    seen: usize,
+    sum: f32,
+    greatest: f32,
+}
+
+impl Lowest {
+    #[inline(always)]
+    fn add(&mut self, cost: Option<f32>) {
+        let Some(cost) = cost else { return };
+        self.seen += 1;
+        self.sum += cost;
+        self.greatest = self.greatest.max(cost);
     }
 
-    /// Mean of the lowest costs, as many as are wanted.
-    fn mean_of_best(&self, costs: &mut [f32]) -> f32 {
-        if costs.is_empty() {
-            return UNSEEN;
+    #[inline(always)]
+    fn mean(&self) -> f32 {
+        match self.seen {
+            0 => UNSEEN,
+            n if n <= self.wanted => self.sum / n as f32,
+            _ => (self.sum - self.greatest) / self.wanted as f32,
         }
-        let n = self.wanted().min(costs.len());
-        costs.sort_unstable_by(f32::total_cmp);
-        costs[..n].iter().sum::<f32>() / n as f32
     }
 }
 
@@ -361,7 +378,11 @@ fn miss(surface: &SourceSurface, view: &View, at: Affine) -> f32 {
     }
     let (m, o) = (&surface.back.matrix, &surface.back.offset);
     let q: [f32; 3] = std::array::from_fn(|i| m[3 * i] * at.u + m[3 * i + 1] * at.v + m[3 * i + 2] + o[i] / depth);
-    if q[2] <= 1e-9 { GEOMETRY_REACH } else { (q[0] / q[2] - view.x).hypot(q[1] / q[2] - view.y) }
+    if q[2] <= 1e-9 {
+        return GEOMETRY_REACH;
+    }
+    let (dx, dy) = (q[0] / q[2] - view.x, q[1] / q[2] - view.y);
+    (dx * dx + dy * dy).sqrt()
 }
 
 /// SplitMix64 of pixel and iteration.
@@ -453,7 +474,8 @@ mod tests {
         let sums = sums_for_this_cpu();
         let scene =
             Scene { reference: rasters[0], sources: &quads, surfaces: &[], prior: &prior, params: &params, sums };
-        let view = scene.view(20, 15);
+        let mut view = scene.view(20, 15);
+        view.asked = scene.shortlist(&view, Hypothesis { w: 2.0, ..Default::default() }).0;
         let mut stopped = 0;
         for step in 0..60 {
             let plane = Hypothesis { w: 0.5 + 0.3 * step as f32, ..Default::default() };
