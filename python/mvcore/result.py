@@ -89,7 +89,11 @@ class Reconstruction:
             for material in tree.get("materials", []):
                 material.setdefault("extensions", {})["KHR_materials_unlit"] = {}
 
-        return export_glb(self.mesh.scene(), tree_postprocessor=unlit)
+        mesh = self.mesh
+        encoded = _core.encode_png(np.ascontiguousarray(self.texture))
+        # trimesh has Pillow encode the image, which takes longer than all the rest of the export for a tenth less bytes.
+        mesh.visual.material.baseColorTexture.save = lambda file, format: file.write(encoded)
+        return export_glb(mesh.scene(), tree_postprocessor=unlit)
 
     def vertex_colours(self) -> NDArray[np.uint8]:
         """Texture colour of each vertex, (V, 3) uint8."""

@@ -43,39 +43,62 @@ pub fn match_epipolar(
 }
 
 fn best(a: Features, b: Features, fundamental: &[f64; 9], band: f32, ratio: f32) -> Vec<Option<u32>> {
+    let columns: Vec<f32> = b.positions.iter().map(|p| p[0]).collect();
+    let rows: Vec<f32> = b.positions.iter().map(|p| p[1]).collect();
     (0..a.positions.len())
         .into_par_iter()
-        .map(|i| best_of_one(a.positions[i], &a.descriptors[i], b, fundamental, band, ratio))
+        .map(|i| {
+            let line = epipolar_line(fundamental, a.positions[i]);
+            best_of_one(&a.descriptors[i], line, (&columns, &rows), b.descriptors, band, ratio)
+        })
         .collect()
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl+avx2+fma+bmi2", "x86_64+avx2+fma+bmi2", "aarch64+neon"))]
-fn best_of_one(
-    position: [f32; 2],
-    descriptor: &[u8; DESCRIPTOR],
-    b: Features,
-    f: &[f64; 9],
-    band: f32,
-    ratio: f32,
-) -> Option<u32> {
+/// The line `p x + q y + r = 0` in b of a pixel of a, scaled so that its left side is the distance in pixels.
+fn epipolar_line(f: &[f64; 9], position: [f32; 2]) -> [f32; 3] {
     let (x, y) = (f64::from(position[0]), f64::from(position[1]));
     let line: [f64; 3] = std::array::from_fn(|r| f[3 * r] * x + f[3 * r + 1] * y + f[3 * r + 2]);
     let length = line[0].hypot(line[1]).max(1e-300);
-    let [p, q, r] = line.map(|v| (v / length) as f32);
+    line.map(|v| (v / length) as f32)
+}
+
+/// Features whose distances from a line are found at once: hardly any of them lies on it.
+const AT_ONCE: usize = 32;
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl+avx2+fma+bmi2", "x86_64+avx2+fma+bmi2", "aarch64+neon"))]
+fn best_of_one(
+    descriptor: &[u8; DESCRIPTOR],
+    [p, q, r]: [f32; 3],
+    (columns, rows): (&[f32], &[f32]),
+    descriptors: &[[u8; DESCRIPTOR]],
+    band: f32,
+    ratio: f32,
+) -> Option<u32> {
     let (mut first, mut second, mut winner) = (i32::MAX, i32::MAX, None);
-    for (j, at) in b.positions.iter().enumerate() {
-        if (p * at[0] + q * at[1] + r).abs() > band {
+    for (part, (columns, rows)) in columns.chunks(AT_ONCE).zip(rows.chunks(AT_ONCE)).enumerate() {
+        let mut beyond = [f32::INFINITY; AT_ONCE];
+        for ((d, x), y) in beyond.iter_mut().zip(columns).zip(rows) {
+            *d = (p * x + q * y + r).abs();
+        }
+        let mut any = false;
+        for d in &beyond {
+            any |= *d <= band;
+        }
+        if !any {
             continue;
         }
-        let mut distance = 0i32;
-        for (s, t) in descriptor.iter().zip(&b.descriptors[j]) {
-            let d = i32::from(*s) - i32::from(*t);
-            distance += d * d;
-        }
-        if distance < first {
-            (second, first, winner) = (first, distance, Some(j as u32));
-        } else if distance < second {
-            second = distance;
+        for k in (0..columns.len()).filter(|&k| beyond[k] <= band) {
+            let j = part * AT_ONCE + k;
+            let mut distance = 0i32;
+            for (s, t) in descriptor.iter().zip(&descriptors[j]) {
+                let d = i16::from(*s) - i16::from(*t);
+                distance += i32::from(d) * i32::from(d);
+            }
+            if distance < first {
+                (second, first, winner) = (first, distance, Some(j as u32));
+            } else if distance < second {
+                second = distance;
+            }
         }
     }
     let limit = f64::from(ratio).powi(2) * f64::from(second);
