@@ -1,7 +1,7 @@
 //! Sums over a slanted window: the inner loop of [`crate::slanted`], eight samples at a time with AVX2, sixteen with AVX-512.
 //!
 //! A source image is stored as [`Quads`]: each pixel with its right, lower and lower-right neighbour in one 32-bit word, so
-//! that one gather fetches all four taps of a bilinear sample. The only `unsafe` code of the crate lives here.
+//! that one load fetches all four taps of a bilinear sample, which two integer instructions then blend. The only `unsafe` code of the crate lives here.
 
 use crate::raster::Raster;
 
@@ -73,7 +73,7 @@ impl Quads {
 pub struct Window {
     /// Sample weights, summing to 1.
     pub weight: [f32; SAMPLES],
-    /// Weight times grey value.
+    /// Weight times grey value above [`GREY_ZERO`].
     pub weighted: [f32; SAMPLES],
 }
 
@@ -88,13 +88,13 @@ pub struct Affine {
     pub jacobian: [f32; 4],
 }
 
-/// `(Σ w s, Σ w s², Σ w r s)` of source samples s and reference samples r.
+/// `(Σ w s, Σ w s², Σ w r s)` of source samples s and reference samples r, grey levels above [`GREY_ZERO`].
 pub type SumsOf = fn(&Quads, &Window, Affine) -> [f32; 3];
 
 /// The fastest [`SumsOf`] this CPU can run.
 pub fn sums_for_this_cpu() -> SumsOf {
     #[cfg(target_arch = "x86_64")]
-    if std::is_x86_feature_detected!("avx512f") {
+    if std::is_x86_feature_detected!("avx512bw") {
         // SAFETY: the CPU has the feature that the function is compiled for, checked just above.
         return |q, w, a| unsafe { sums_avx512(q, w, a) };
     }
@@ -106,6 +106,17 @@ pub fn sums_for_this_cpu() -> SumsOf {
     sums_portable
 }
 
+/// Bits of a sample's place between pixels.
+const BITS: u32 = 7;
+/// Steps from one pixel to the next.
+const UNIT: f32 = (1 << BITS) as f32;
+/// Turns a word's grey levels into signed ones: g - [`GREY_ZERO`].
+const CENTRED: i32 = i32::from_ne_bytes([0x80; 4]);
+/// A step n along x times the first plus the second: the byte pairs (128 - n, n) for the upper and the lower pixels.
+const ACROSS: (i32, i32) = (0x00ff_00ff, 0x0080_0080);
+/// The grey level that counts as 0 in all sums.
+pub const GREY_ZERO: f32 = 128.0;
+
 /// The readable twin.
 pub fn sums_portable(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
     let (dx, dy, n) = (&OFFSETS.0, &OFFSETS.1, OFFSETS.2);
@@ -113,11 +124,12 @@ pub fn sums_portable(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
     let (x_max, y_max) = ((source.width - 1) as f32, (source.height - 1) as f32);
     let mut sums = [0.0; 3];
     for i in 0..n {
-        let u = (at.u + dx[i] * ux + dy[i] * uy).clamp(0.0, x_max);
-        let v = (at.v + dx[i] * vx + dy[i] * vy).clamp(0.0, y_max);
-        let (x, y) = (u as usize, v as usize);
-        let (fx, fy) = (u - x as f32, v - y as f32);
-        let [a, b, c, d] = source.words[y * source.width + x].to_le_bytes().map(f32::from);
+        let u = UNIT * (at.u + dx[i] * ux + dy[i] * uy).clamp(0.0, x_max);
+        let v = UNIT * (at.v + dx[i] * vx + dy[i] * vy).clamp(0.0, y_max);
+        let (u, v) = (u.round_ties_even() as usize, v.round_ties_even() as usize);
+        let (x, y) = (u >> BITS, v >> BITS);
+        let (fx, fy) = ((u as f32 / UNIT).fract(), (v as f32 / UNIT).fract());
+        let [a, b, c, d] = source.words[y * source.width + x].to_le_bytes().map(|g| f32::from(g) - GREY_ZERO);
         let (top, bottom) = (a + fx * (b - a), c + fx * (d - c));
         let s = top + fy * (bottom - top);
         sums[0] += window.weight[i] * s;
@@ -128,14 +140,15 @@ pub fn sums_portable(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f")]
+#[target_feature(enable = "avx512f,avx512bw")]
 fn sums_avx512(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
     use std::arch::x86_64::*;
     let zero = _mm512_setzero_ps();
-    let (x_max, y_max) = (_mm512_set1_ps((source.width - 1) as f32), _mm512_set1_ps((source.height - 1) as f32));
-    let [ux, vx, uy, vy] = at.jacobian.map(|j| _mm512_set1_ps(j));
-    let (u0, v0) = (_mm512_set1_ps(at.u), _mm512_set1_ps(at.v));
-    let (stride, byte) = (_mm512_set1_epi32(source.width as i32), _mm512_set1_epi32(0xff));
+    let x_max = _mm512_set1_ps(UNIT * (source.width - 1) as f32);
+    let y_max = _mm512_set1_ps(UNIT * (source.height - 1) as f32);
+    let [ux, vx, uy, vy] = at.jacobian.map(|j| _mm512_set1_ps(UNIT * j));
+    let (u0, v0) = (_mm512_set1_ps(UNIT * at.u), _mm512_set1_ps(UNIT * at.v));
+    let (stride, between) = (_mm512_set1_epi32(source.width as i32), _mm512_set1_epi32(UNIT as i32 - 1));
     let (mut s1, mut s2, mut rs) = (zero, zero, zero);
     for i in (0..SAMPLES).step_by(16) {
         // SAFETY: i + 16 <= SAMPLES, the length of all four arrays.
@@ -150,25 +163,27 @@ fn sums_avx512(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
         let u = _mm512_fmadd_ps(dx, ux, _mm512_fmadd_ps(dy, uy, u0));
         let v = _mm512_fmadd_ps(dx, vx, _mm512_fmadd_ps(dy, vy, v0));
         // max first: it returns its second operand for NaN, so that the index below is always inside.
-        let u = _mm512_min_ps(_mm512_max_ps(u, zero), x_max);
-        let v = _mm512_min_ps(_mm512_max_ps(v, zero), y_max);
-        let (x, y) = (_mm512_cvttps_epi32(u), _mm512_cvttps_epi32(v));
-        let (fx, fy) = (_mm512_sub_ps(u, _mm512_cvtepi32_ps(x)), _mm512_sub_ps(v, _mm512_cvtepi32_ps(y)));
+        let u = _mm512_cvtps_epi32(_mm512_min_ps(_mm512_max_ps(u, zero), x_max));
+        let v = _mm512_cvtps_epi32(_mm512_min_ps(_mm512_max_ps(v, zero), y_max));
+        let (x, y) = (_mm512_srli_epi32::<BITS>(u), _mm512_srli_epi32::<BITS>(v));
+        let (fx, fy) = (_mm512_and_si512(u, between), _mm512_and_si512(v, between));
         let index = _mm512_add_epi32(_mm512_mullo_epi32(y, stride), x);
         // SAFETY: 0 <= x < width and 0 <= y < height by the clamps, and `words` holds width * height words.
-        let quad = unsafe { _mm512_i32gather_epi32::<4>(index, source.words.as_ptr().cast()) };
-        let tap = |shifted| _mm512_cvtepi32_ps(_mm512_and_si512(shifted, byte));
-        let (a, b) = (tap(quad), tap(_mm512_srli_epi32::<8>(quad)));
-        let (c, d) = (tap(_mm512_srli_epi32::<16>(quad)), tap(_mm512_srli_epi32::<24>(quad)));
-        let top = _mm512_fmadd_ps(fx, _mm512_sub_ps(b, a), a);
-        let bottom = _mm512_fmadd_ps(fx, _mm512_sub_ps(d, c), c);
-        let s = _mm512_fmadd_ps(fy, _mm512_sub_ps(bottom, top), top);
+        let four = |index: __m128i| unsafe { four_words(source.words.as_ptr(), index) };
+        let quad = _mm512_castsi128_si512(four(_mm512_castsi512_si128(index)));
+        let quad = _mm512_inserti32x4::<1>(quad, four(_mm512_extracti32x4_epi32::<1>(index)));
+        let quad = _mm512_inserti32x4::<2>(quad, four(_mm512_extracti32x4_epi32::<2>(index)));
+        let quad = _mm512_inserti32x4::<3>(quad, four(_mm512_extracti32x4_epi32::<3>(index)));
+        let grey = _mm512_xor_si512(quad, _mm512_set1_epi32(CENTRED));
+        let across = _mm512_add_epi32(_mm512_mullo_epi32(fx, _mm512_set1_epi32(ACROSS.0)), _mm512_set1_epi32(ACROSS.1));
+        let down = _mm512_add_epi32(_mm512_sub_epi32(_mm512_slli_epi32::<16>(fy), fy), _mm512_set1_epi32(UNIT as i32));
+        let s = _mm512_cvtepi32_ps(_mm512_madd_epi16(_mm512_maddubs_epi16(across, grey), down));
         let ws = _mm512_mul_ps(weight, s);
         s1 = _mm512_add_ps(s1, ws);
         s2 = _mm512_fmadd_ps(ws, s, s2);
         rs = _mm512_fmadd_ps(weighted, s, rs);
     }
-    [s1, s2, rs].map(|lanes| _mm512_reduce_add_ps(lanes))
+    scaled([s1, s2, rs].map(|lanes| _mm512_reduce_add_ps(lanes)))
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -176,11 +191,11 @@ fn sums_avx512(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
 fn sums_avx2(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
     use std::arch::x86_64::*;
     let zero = _mm256_setzero_ps();
-    let (x_max, y_max) = (_mm256_set1_ps((source.width - 1) as f32), _mm256_set1_ps((source.height - 1) as f32));
-    let [ux, vx, uy, vy] = at.jacobian.map(|j| _mm256_set1_ps(j));
-    let (u0, v0) = (_mm256_set1_ps(at.u), _mm256_set1_ps(at.v));
-    let stride = _mm256_set1_epi32(source.width as i32);
-    let byte = _mm256_set1_epi32(0xff);
+    let x_max = _mm256_set1_ps(UNIT * (source.width - 1) as f32);
+    let y_max = _mm256_set1_ps(UNIT * (source.height - 1) as f32);
+    let [ux, vx, uy, vy] = at.jacobian.map(|j| _mm256_set1_ps(UNIT * j));
+    let (u0, v0) = (_mm256_set1_ps(UNIT * at.u), _mm256_set1_ps(UNIT * at.v));
+    let (stride, between) = (_mm256_set1_epi32(source.width as i32), _mm256_set1_epi32(UNIT as i32 - 1));
     let (mut s1, mut s2, mut rs) = (zero, zero, zero);
     for i in (0..OFFSETS.2).step_by(8) {
         // SAFETY: i + 8 <= SAMPLES, the length of all four arrays.
@@ -195,29 +210,54 @@ fn sums_avx2(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
         let u = _mm256_fmadd_ps(dx, ux, _mm256_fmadd_ps(dy, uy, u0));
         let v = _mm256_fmadd_ps(dx, vx, _mm256_fmadd_ps(dy, vy, v0));
         // max first: it returns its second operand for NaN, so that the index below is always inside.
-        let u = _mm256_min_ps(_mm256_max_ps(u, zero), x_max);
-        let v = _mm256_min_ps(_mm256_max_ps(v, zero), y_max);
-        let (x, y) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
-        let (fx, fy) = (_mm256_sub_ps(u, _mm256_cvtepi32_ps(x)), _mm256_sub_ps(v, _mm256_cvtepi32_ps(y)));
+        let u = _mm256_cvtps_epi32(_mm256_min_ps(_mm256_max_ps(u, zero), x_max));
+        let v = _mm256_cvtps_epi32(_mm256_min_ps(_mm256_max_ps(v, zero), y_max));
+        let (x, y) = (_mm256_srli_epi32::<{ BITS as i32 }>(u), _mm256_srli_epi32::<{ BITS as i32 }>(v));
+        let (fx, fy) = (_mm256_and_si256(u, between), _mm256_and_si256(v, between));
         let index = _mm256_add_epi32(_mm256_mullo_epi32(y, stride), x);
         // SAFETY: 0 <= x < width and 0 <= y < height by the clamps, and `words` holds width * height words.
-        let quad = unsafe { _mm256_i32gather_epi32::<4>(source.words.as_ptr().cast::<i32>(), index) };
-        let tap = |shifted| _mm256_cvtepi32_ps(_mm256_and_si256(shifted, byte));
-        let (a, b) = (tap(quad), tap(_mm256_srli_epi32::<8>(quad)));
-        let (c, d) = (tap(_mm256_srli_epi32::<16>(quad)), tap(_mm256_srli_epi32::<24>(quad)));
-        let top = _mm256_fmadd_ps(fx, _mm256_sub_ps(b, a), a);
-        let bottom = _mm256_fmadd_ps(fx, _mm256_sub_ps(d, c), c);
-        let s = _mm256_fmadd_ps(fy, _mm256_sub_ps(bottom, top), top);
+        let four = |index: __m128i| unsafe { four_words(source.words.as_ptr(), index) };
+        let quad = _mm256_castsi128_si256(four(_mm256_castsi256_si128(index)));
+        let quad = _mm256_inserti128_si256::<1>(quad, four(_mm256_extracti128_si256::<1>(index)));
+        let grey = _mm256_xor_si256(quad, _mm256_set1_epi32(CENTRED));
+        let across = _mm256_add_epi32(_mm256_mullo_epi32(fx, _mm256_set1_epi32(ACROSS.0)), _mm256_set1_epi32(ACROSS.1));
+        let down = _mm256_add_epi32(_mm256_sub_epi32(_mm256_slli_epi32::<16>(fy), fy), _mm256_set1_epi32(UNIT as i32));
+        let s = _mm256_cvtepi32_ps(_mm256_madd_epi16(_mm256_maddubs_epi16(across, grey), down));
         let ws = _mm256_mul_ps(weight, s);
         s1 = _mm256_add_ps(s1, ws);
         s2 = _mm256_fmadd_ps(ws, s, s2);
         rs = _mm256_fmadd_ps(weighted, s, rs);
     }
-    [s1, s2, rs].map(|lanes| {
+    scaled([s1, s2, rs].map(|lanes| {
         let half = _mm_add_ps(_mm256_castps256_ps128(lanes), _mm256_extractf128_ps::<1>(lanes));
         let pair = _mm_add_ps(half, _mm_movehl_ps(half, half));
         _mm_cvtss_f32(_mm_add_ss(pair, _mm_shuffle_ps::<1>(pair, pair)))
-    })
+    }))
+}
+
+/// Words of four indices. Single loads: the gather instruction is slower on AMD's cores and on Intel's patched ones.
+///
+/// # Safety
+/// All four indices lie inside `words`.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "sse4.1")]
+#[inline]
+unsafe fn four_words(words: *const u32, index: std::arch::x86_64::__m128i) -> std::arch::x86_64::__m128i {
+    use std::arch::x86_64::*;
+    let (low, high) = (_mm_cvtsi128_si64(index) as u64, _mm_extract_epi64::<1>(index) as u64);
+    // SAFETY: the caller's word.
+    let word = |n: u64| unsafe { *words.add(n as u32 as usize) } as i32;
+    let found = _mm_cvtsi32_si128(word(low));
+    let found = _mm_insert_epi32::<1>(found, word(low >> 32));
+    let found = _mm_insert_epi32::<2>(found, word(high));
+    _mm_insert_epi32::<3>(found, word(high >> 32))
+}
+
+/// Sums of samples in fixed point brought back to grey levels.
+#[inline(always)]
+fn scaled([s1, s2, rs]: [f32; 3]) -> [f32; 3] {
+    const GREY: f32 = 1.0 / (UNIT * UNIT);
+    [s1 * GREY, s2 * (GREY * GREY), rs * GREY]
 }
 
 #[cfg(test)]

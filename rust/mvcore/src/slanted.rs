@@ -13,7 +13,7 @@
 //! for any thread count.
 
 use crate::error::{Result, require};
-use crate::patch::{Affine, OFFSETS, Quads, SAMPLES, SumsOf, Window, sums_for_this_cpu};
+use crate::patch::{Affine, GREY_ZERO, OFFSETS, Quads, SAMPLES, SumsOf, Window, sums_for_this_cpu};
 use crate::raster::{Epipolar, Raster};
 use rayon::prelude::*;
 
@@ -178,7 +178,7 @@ impl Scene<'_> {
             let grey = image.data[v * image.width + u];
             let weight = colour[grey.abs_diff(centre) as usize] * space[i];
             window.weight[i] = weight;
-            window.weighted[i] = f32::from(grey);
+            window.weighted[i] = f32::from(grey) - GREY_ZERO;
             total += weight;
         }
         let (mut mean, mut square) = (0.0, 0.0);
