@@ -1,7 +1,8 @@
 //! Sums over a slanted window: the inner loop of [`crate::slanted`], eight samples at a time with AVX2, sixteen with AVX-512.
 //!
 //! A source image is stored as [`Quads`]: each pixel with its right, lower and lower-right neighbour in one 32-bit word, so
-//! that one load fetches all four taps of a bilinear sample, which two integer instructions then blend. The only `unsafe` code of the crate lives here.
+//! that one load fetches all four taps of a bilinear sample, which two integer instructions then blend. The only `unsafe`
+//! code of the crate lives here.
 
 use crate::raster::Raster;
 
