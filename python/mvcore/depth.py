@@ -451,7 +451,7 @@ UNEXPOSED = 10
 
 def _unexposed(view: View) -> NDArray[np.bool_]:
     """Where a picture is black: night, a black cloth, the border that undistortion leaves. Nothing can be matched there."""
-    brightest = view.grey if view.colour is None else view.colour.max(2)
+    brightest = view.grey if view.colour is None else np.maximum.reduce(cv2.split(view.colour))
     return np.asarray(cv2.dilate(brightest, np.ones((3, 3), np.uint8)) < UNEXPOSED)
 
 

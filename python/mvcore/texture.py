@@ -59,6 +59,12 @@ def _detail(image: Image, mask: NDArray[np.uint8] | None, erosion: int) -> NDArr
     return detail
 
 
+def _within(colours: NDArray[np.uint8], low: int, high: int) -> NDArray[np.bool_]:
+    """Where all channels lie between two levels; a channel at a time, for NumPy reduces a short axis slowly."""
+    inside = [(colours[:, k] > low) & (colours[:, k] < high) for k in range(3)]
+    return np.asarray(inside[0] & inside[1] & inside[2])
+
+
 def colour_gains(qualities: Sequence[NDArray[np.float32]], colours: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
     """Factor a channel that brings each photograph to common colours, (V, 3).
 
@@ -66,7 +72,7 @@ def colour_gains(qualities: Sequence[NDArray[np.float32]], colours: Sequence[NDA
     """
     n = len(qualities)
     matrix, vector = 0.01 * np.eye(n), np.zeros((n, 3))
-    usable = [(q > 0) & (c.min(1) > 12) & (c.max(1) < 245) for q, c in zip(qualities, colours, strict=True)]
+    usable = [(q > 0) & _within(c, 12, 245) for q, c in zip(qualities, colours, strict=True)]
     for i in range(n):
         for j in range(i + 1, n):
             both = np.flatnonzero(usable[i] & usable[j])
