@@ -22,7 +22,7 @@ use mvcore::photo_carve::{Photo as Coloured, PhotoParams, photo_carve};
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::rasterize::rasterize;
 use mvcore::select_views::{Photo, SelectParams, rate, select_views};
-use mvcore::shade::{Shot, Surface};
+use mvcore::shade::{Shots, Surface};
 use mvcore::slanted::{Hypothesis, RefineParams, refine};
 use mvcore::sweep::sweep;
 use std::hint::black_box;
@@ -252,18 +252,19 @@ fn meshes(c: &mut Criterion) {
     let uv: Vec<[f32; 2]> = vertices.iter().map(|v| [v[0] as f32, v[1] as f32]).collect();
     let normals: Vec<[f32; 3]> = vertices.iter().map(|v| v.map(|x| (x / 0.96) as f32)).collect();
     let materials = vec![0; surface.faces.len()];
-    let tile: Vec<u8> = (0..256 * 256 * 3).map(|i| shade((i / 3 % 256) as f32, (i / 768) as f32)).collect();
+    // Two textures: the material's, and the surroundings that it mirrors.
+    let tiles: Vec<u8> = (0..2 * 256 * 256 * 3).map(|i| shade((i / 3 % 256) as f32, (i / 768) as f32)).collect();
     let covering = Surface {
         uv: &uv,
         normals: &normals,
         materials: &materials,
-        textures: &tile,
+        textures: &tiles,
         size: 256,
-        gloss: &[[0.4, 0.6, 0.3, 20.0]],
+        gloss: &[[0.4, 0.6, 0.3, 20.0, 0.1]],
     };
-    let shot = Shot { projection: p, lamp: [0.0, 0.0, 4.0], width: 256, height: 192, samples: 2 };
+    let shots = Shots { projections: &[p], lamp: [0.0, 0.0, 4.0], width: 256, height: 192, samples: 2 };
     group.bench_function("shade 256x192, 4 samples a pixel", |b| {
-        b.iter(|| mvcore::shade::shade(mesh, covering, &shot).unwrap());
+        b.iter(|| mvcore::shade::shade(mesh, covering, &shots).unwrap());
     });
     let (depth, _) = rasterize(mesh, &p, w, h).unwrap();
     let photo = Photo {

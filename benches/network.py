@@ -68,7 +68,7 @@ def size(arguments):
 
 def heldout(arguments):
     net = load_disparity(arguments.weights)
-    print({k: round(v, 4) for k, v in validate(net, Recipe(), torch.device("cpu"), 40).items()})
+    print({k: round(v, 4) for k, v in validate(net, Recipe().seed, torch.device("cpu"), 40).items()})
 
 
 def _compared(matcher, pairs):
@@ -203,7 +203,7 @@ def ablation(arguments):
             training = Training(steps=steps, every=steps, warmup=20, averaging=0.98, recipe=Recipe(width=160, height=112, **data), **build)
             train_disparity(training, Path(folder), report=lambda _: None)
             net = load_disparity(Path(folder) / "best.safetensors")
-        figures = validate(net, Recipe(), torch.device("cpu"), 10)
+        figures = validate(net, Recipe().seed, torch.device("cpu"), 10)
         print(f"  {name:20s}" + "".join(f"  {k} {v:.3f}" for k, v in figures.items()), flush=True)
 
 

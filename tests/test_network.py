@@ -27,7 +27,7 @@ def tiles():
 
 
 def test_planes_land_where_the_cameras_project(tiles):
-    sample = random_views(np.random.default_rng(1), tiles, 2, 64, 48)
+    sample = random_views(np.random.default_rng(1), tiles, 2, 64, 48)[0]
     reference, source = sample.cameras
     maps = torch.from_numpy(relative_map(reference, source))[None]
     x, y = landing(maps, torch.from_numpy(sample.inverse)[None, None])
@@ -43,17 +43,20 @@ def test_planes_land_where_the_cameras_project(tiles):
 
 
 def test_the_true_plane_correlates_best(tiles):
-    """Correlating the images themselves, the true disparity beats its neighbours where both views see the surface."""
-    sample = random_pair(np.random.default_rng(3), tiles, 128, 96, max_disparity=30.0)
-    images = [torch.from_numpy(i).permute(2, 0, 1)[None].float() for i in sample.images]
-    patches = [torch.nn.functional.unfold(i, 7, padding=3).view(1, -1, 96, 128) for i in images]
-    features = [unit(p - p.mean(1, keepdim=True), 1) for p in patches]
+    """Correlating the images themselves, the true disparity beats its neighbours where both views see the surface, in the mirror too."""
+    looks = [random_pair(np.random.default_rng(seed), tiles, 128, 96, max_disparity=30.0) for seed in range(8)]
     planes = torch.arange(0, 36.0).view(1, -1, 1, 1).expand(1, 36, 96, 128)
-    maps = torch.from_numpy(relative_map(*sample.cameras))[None]
-    corr = correlate(features[0], features[1:], [maps], planes, 1, torch.ones(1), torch.zeros(()))
-    found = corr[0, 0].argmax(0).numpy()
-    right = np.abs(found - sample.inverse) < 1.5
-    assert right[sample.seen[0]].mean() > 0.5
+    for pair in zip(*looks, strict=True):
+        shares = []
+        for sample in pair:
+            images = [torch.from_numpy(i.copy()).permute(2, 0, 1)[None].float() for i in sample.images]
+            patches = [torch.nn.functional.unfold(i, 7, padding=3).view(1, -1, 96, 128) for i in images]
+            features = [unit(p - p.mean(1, keepdim=True), 1) for p in patches]
+            maps = torch.from_numpy(relative_map(*sample.cameras))[None]
+            corr = correlate(features[0], features[1:], [maps], planes, 1, torch.ones(1), torch.zeros(()))
+            right = np.abs(corr[0, 0].argmax(0).numpy() - sample.inverse) < 1.5
+            shares.append(right[sample.seen[0]].mean())
+        assert np.median(shares) > 0.5
 
 
 def test_gradients_of_the_cost_space_equal_finite_differences():

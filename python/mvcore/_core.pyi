@@ -37,6 +37,7 @@ __all__ = [
     "select_views",
     "shade",
     "sweep",
+    "weighted_median",
 ]
 
 _F32 = NDArray[np.float32]
@@ -49,6 +50,9 @@ _I64 = NDArray[np.int64]
 def sweep(reference: _U8, images: Sequence[_U8], maps: _F32, planes: _F32, best: int = 0) -> _U8: ...
 def aggregate(costs: _U8, guide: _U8, p1: int, p2: int, p2_falloff: int) -> tuple[_F32, _F32]: ...
 def expect(costs: _U8, expected: _F32, confidence: _F32, weight: float, reach: float) -> None: ...
+def weighted_median(
+    values: _F32, guide: _U8, doubtful: _U8, *, radius: int, step: int, colour: float, distance: float, slack: float
+) -> _F32: ...
 def correlate(reference: _F32, sources: Sequence[_F32], maps: _F32, planes: _F32, gain: _F32, bias: float) -> _F32: ...
 def refine(
     reference: _U8,
@@ -144,7 +148,7 @@ def shade(
     materials: NDArray[np.uint16],
     textures: _U8,
     gloss: _F32,
-    matrix: _F64,
+    matrices: _F64,
     lamp: Sequence[float],
     width: int,
     height: int,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -349,11 +350,16 @@ def train_disparity_network(
     steps: Annotated[int, typer.Option(min=1, help="Batches in all.")] = 10_000,
     preset: Annotated[str, typer.Option(help="compact or paper.")] = "compact",
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    hours: Annotated[float | None, typer.Option(help="Stop after this long, with a checkpoint.")] = None,
+    hours: Annotated[float | None, typer.Option(help="End after this long if not by the steps; the rate falls to zero by then.")] = None,
     data: Annotated[
         list[str] | None, typer.Option(help="A published set, LAYOUT:FOLDER (dtu, blendedmvs, sceneflow, kitti, middlebury).")
     ] = None,
     middlebury: Annotated[Path | None, typer.Option(help="Folder of Middlebury pairs to validate on as well.")] = None,
+    batch: Annotated[int, typer.Option(min=2, help="Samples a batch.")] = 2,
+    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the samples, multiples of 16.")] = "256x192",
+    workers: Annotated[int, typer.Option(min=0, help="Processes that render.")] = 1,
+    rate: Annotated[float, typer.Option(help="Learning rate.")] = 1e-3,
+    start: Annotated[Path | None, typer.Option(help="Weights to begin from.")] = None,
     debug: Debug = False,
 ) -> None:
     """Train the disparity network on procedural scenes, and on published sets where given."""
@@ -368,10 +374,20 @@ def train_disparity_network(
             raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
         for source in data or ():
             print(f"{source}: {len(find_items(source))} samples")
-        recipe = Recipe(data=tuple(data or ()))
+        width, height = _sides(size)
+        recipe = Recipe(data=tuple(data or ()), batch=batch, width=width, height=height)
         pairs = str(middlebury) if middlebury else None
-        print(train_disparity(Training(steps=steps, preset=preset, hours=hours, recipe=recipe, middlebury=pairs), out, device))
+        begun = str(start) if start else None
+        training = Training(steps, preset, rate=rate, hours=hours, workers=workers, recipe=recipe, middlebury=pairs, start=begun)
+        print(train_disparity(training, out, device))
         plot_log(out / "log.csv", out / "log.png")
+
+
+def _sides(size: str) -> tuple[int, int]:
+    sides = [int(n) for n in size.split("x")] if re.fullmatch(r"\d+x\d+", size) else []
+    if len(sides) != 2 or min(sides) < 32 or sides[0] % 16 or sides[1] % 16:
+        raise ValueError(f"--size: expected WIDTHxHEIGHT, multiples of 16 from 32 on, got {size!r}")
+    return sides[0], sides[1]
 
 
 @train.command("recognition")

@@ -57,6 +57,8 @@ class DepthConfig:
     """Aggregation penalty of a larger step on an even surface, cost units."""
     p2_falloff: int = 12
     """Grey levels of an image edge at which `p2` has halved."""
+    edge_radius: int = 14
+    """Pixels of the sweep's scale around a pixel whose colours and depths decide whose side of an edge it is on; 0 leaves that out."""
     sweep_rounds: int = 3
     """Rounds of slanted refinement at the sweep's scale, where they are cheap."""
     rounds: int = 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -78,13 +79,17 @@ def _upsample(planes: Map, width: int, height: int) -> Map:
 
 @dataclass(frozen=True)
 class _Scale:
-    """One size of the problem: images (reference first), relative maps there (S, 12) and back, the slope limit, where depth is unwanted."""
+    """One size of the problem: images (reference first), relative maps there (S, 12) and back, the slope limit, where depth is unwanted.
+
+    ``guide`` are the reference's colours (h, w, 3) uint8, where the sweep runs.
+    """
 
     greys: list[Grey]
     there: Map
     back: Map
     max_slope: float
     unwanted: NDArray[np.bool_] | None = None
+    guide: NDArray[np.uint8] | None = None
 
 
 LEAST_CONFIDENCE = 0.1
@@ -154,7 +159,22 @@ def _aggregated(
         place = (expected.inverse - np.float32(low)) / (inverse[1] - inverse[0])
         _core.expect(costs, place, expected.confidence, config.network_weight, config.network_reach)
     index, margin = _core.aggregate(costs, scale.greys[0], config.p1, config.p2, config.p2_falloff)
+    if scale.guide is not None and config.edge_radius:
+        index = _sharpened(index, np.zeros(index.shape, np.uint8), scale.guide, config.edge_radius, 1)
     return (low + index * float(inverse[1] - inverse[0])).astype(np.float32), margin
+
+
+def _sharpened(values: Map, doubtful: NDArray[Any], guide: NDArray[np.uint8], radius: int, rounds: int) -> Map:
+    """Disparities, or places among planes, with their edges on the picture's: windows that straddle an edge fatten what is in front.
+
+    What is doubtful is replaced anyhow, the rest where it errs by more than one.
+    """
+    guide, doubtful = np.ascontiguousarray(guide), np.asarray(doubtful, np.uint8)
+    for _ in range(rounds):
+        values = _core.weighted_median(
+            values, guide, doubtful, radius=radius, step=min(2, radius), colour=10.0, distance=0.6 * radius, slack=1.0
+        )
+    return values
 
 
 def _sweep(scale: _Scale, low: float, high: float, planes: int, config: DepthConfig, expected: _Expected | None = None) -> _Hypotheses:
@@ -201,8 +221,15 @@ def _pyramid(reference: View, sources: Sequence[View], config: DepthConfig) -> l
         there = np.stack([relative_map(mine.camera, s.camera) for s in theirs])
         back = np.stack([relative_map(s.camera, mine.camera) for s in theirs])
         slope = float(np.tan(np.radians(config.max_slant)) / mine.camera.K[0, 0])
-        scales.append(_Scale([mine.grey, *(s.grey for s in theirs)], there, back, slope, _unwanted(reference.mask, w, h)))
+        guide = None if scales else _guide(reference, w, h)
+        scales.append(_Scale([mine.grey, *(s.grey for s in theirs)], there, back, slope, _unwanted(reference.mask, w, h), guide))
     return scales
+
+
+def _guide(view: View, width: int, height: int) -> NDArray[np.uint8]:
+    """A view's colours, reduced; its grey levels where it has none."""
+    colours = view.colour if view.colour is not None else np.repeat(view.grey[..., None], 3, 2)
+    return colours if colours.shape[:2] == (height, width) else cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
 
 
 MARGIN = 12
@@ -368,10 +395,12 @@ def refine_depth(
     rough: RoughDepth,
     rough_sources: Sequence[RoughDepth],
     config: DepthConfig | None = None,
+    last: bool = True,
 ) -> DepthMap:
     """Second pass: refined at half size with the sources' own depth as a witness, then at full size.
 
-    ``rough_sources`` are the first passes of the sources, one each, or empty. Where the picture is black there is no depth.
+    ``rough_sources`` are the first passes of the sources, one each, or empty; ``last`` says that no third pass follows. Where the
+    picture is black there is no depth.
     """
     config = config or DepthConfig()
     found = rough.hypotheses
@@ -382,7 +411,8 @@ def refine_depth(
     # At full size each view is on its own again: errors that views hand to each other would pass the filter together.
     # It would cost a quarter more to try adjacent planes here, and they are the same as often as not.
     found = _finer(found, full, config.rounds, config, adjacent=False)
-    return _exposed_depth(reference, found.planes, found.margin)
+    step = found.step * found.prior.shape[1] / reference.grey.shape[1] if last else None
+    return _exposed_depth(reference, found.planes, found.margin, step)
 
 
 SURFACE_MARGIN = 0.25
@@ -435,13 +465,22 @@ def guided_depth(
     prior = np.where(taken, theirs, mine)
     planes = _refine(full, np.where(taken[..., None], two, one), prior, span, step, config.surface_rounds, config, reach, adjacent=False)
     margin = _resized_smoothly(rough.hypotheses.margin, mine.shape)
-    return _exposed_depth(reference, planes, np.where(taken, np.maximum(margin, SURFACE_MARGIN), margin))
+    return _exposed_depth(reference, planes, np.where(taken, np.maximum(margin, SURFACE_MARGIN), margin), step)
 
 
-def _exposed_depth(reference: View, planes: Map, margin: Map) -> DepthMap:
-    """The depth of planes at full size, but where the picture is black."""
+EDGE_STEPS = 2.0
+"""Steps (of about a pixel of parallax) by which a depth may differ from what its colours say: less would take fine relief."""
+
+
+def _exposed_depth(reference: View, planes: Map, margin: Map, step: float | None) -> DepthMap:
+    """The depth of planes at full size, but where the picture is black; given the step between planes, with edges on the picture's."""
     h, w = planes.shape[:2]
     planes = np.where(_unexposed(reference)[..., None], np.float32(0), planes)
+    if step is not None:
+        known = planes[..., 0] > 0
+        places = np.where(known, planes[..., 0] / np.float32(EDGE_STEPS * step), np.float32(np.nan))
+        sharp = _sharpened(places, ~known, _guide(reference, w, h), MEDIAN_RADIUS, 1)
+        planes[..., 0] = np.where(known, sharp * np.float32(EDGE_STEPS * step), 0)
     return _depth_map(planes, _resized_smoothly(margin, (h, w)))
 
 
@@ -550,9 +589,13 @@ def disparity(
     seen = _confirmed(d, theirs[:, ::-1, 0]) & ~_speckles(d)
     cost = mine[..., 3]
     confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
-    if not fill:
-        return np.where(seen, d, 0).astype(np.float32), confidence
-    return _fill_occlusions(d, seen, images[0]), confidence
+    guide = left if left.ndim == 3 else np.repeat(left[..., None], 3, 2)
+    found = _sharpened(_fill_occlusions(d, seen, images[0]), ~seen, guide, MEDIAN_RADIUS, MEDIAN_ROUNDS)
+    return found if fill else np.where(seen, found, 0).astype(np.float32), confidence
+
+
+MEDIAN_RADIUS, MEDIAN_ROUNDS = 10, 2
+"""Of the weighted median at full size; the second round of disparities gains half as much as the first, a third hardly anything."""
 
 
 def _confirmed(d: Map, other: Map) -> NDArray[np.bool_]:

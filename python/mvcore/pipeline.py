@@ -366,10 +366,12 @@ def first_pass(views: Views, plan: Plan, n: int, config: Config) -> depth_stage.
     return depth_stage.sweep_depth(reference, others, *plan.ranges[n], config.depth)
 
 
-def second_pass(views: Views, plan: Plan, n: int, rough: Mapping[int, depth_stage.RoughDepth], config: Config) -> DepthMap:
-    """View ``n``'s depth with its sources' first passes as witnesses."""
+def second_pass(
+    views: Views, plan: Plan, n: int, rough: Mapping[int, depth_stage.RoughDepth], config: Config, last: bool = True
+) -> DepthMap:
+    """View ``n``'s depth with its sources' first passes as witnesses; ``last`` says that no third pass follows."""
     near = [j for j in plan.sources[n] if j in rough]
-    return depth_stage.refine_depth(views.view(n), [views.view(j) for j in near], rough[n], [rough[j] for j in near], config.depth)
+    return depth_stage.refine_depth(views.view(n), [views.view(j) for j in near], rough[n], [rough[j] for j in near], config.depth, last)
 
 
 def third_pass(
@@ -389,7 +391,7 @@ def _depths(views: Views, plan: Plan, config: Config, track: Track) -> tuple[dic
     rough = {n: first_pass(views, plan, n, config) for n in track(used, "depth, first pass", len(used))}
     depths: list[DepthMap | None] = [None] * len(views.images)
     for n in track(used, "depth, second pass", len(used)):
-        depths[n] = second_pass(views, plan, n, rough, config)
+        depths[n] = second_pass(views, plan, n, rough, config, last=not config.depth.surface_rounds)
     return rough, depths
 
 

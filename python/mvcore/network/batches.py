@@ -65,7 +65,7 @@ def _tiles(seed: int, epoch: int, held_out: bool) -> Tiles:
 def make_batch(recipe: Recipe, number: int) -> Batch:
     """Batch ``number`` of a recipe."""
     random = np.random.default_rng((recipe.seed, 3, number))
-    planes = (24, 32, 40)
+    planes = (24, 32, 48)
     if recipe.data and random.random() < recipe.files:
         items = _items(recipe.data[random.integers(len(recipe.data))])
         picked = [items[k]() for k in random.integers(0, len(items), recipe.batch)]
@@ -73,11 +73,12 @@ def make_batch(recipe: Recipe, number: int) -> Batch:
     tiles = _tiles(recipe.seed, number // RENEWED, recipe.held_out)
     size: dict[str, Any] = {"width": recipe.width, "height": recipe.height, "floating": recipe.floating, "wide": recipe.wide}
     if random.random() < recipe.pairs:
-        samples = [random_pair(random, tiles, **size) for _ in range(recipe.batch)]
+        scenes = [random_pair(random, tiles, **size) for _ in range(-(-recipe.batch // 2))]
     else:
-        views = int(random.choice([2, 3, 4], p=[0.2, 0.5, 0.3]))
-        samples = [random_views(random, tiles, views, **size) for _ in range(recipe.batch)]
-    return stack(samples, int(random.choice(planes)))
+        views = int(random.choice([2, 3, 4], p=[0.2, 0.4, 0.4]))
+        scenes = [random_views(random, tiles, views, **size) for _ in range(-(-recipe.batch // 2))]
+    # Two looks at each scene: rendering costs more than training.
+    return stack([look for looks in scenes for look in looks][: recipe.batch], int(random.choice(planes)))
 
 
 def stack(samples: list[Sample], planes: int) -> Batch:

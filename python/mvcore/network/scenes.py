@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .. import _core
 from ..cameras import Camera, euler_to_rotation
 from .photometry import through_a_camera
-from .shapes import Shape, random_rotation, random_shape, wall
+from .shapes import Shape, ground, random_rotation, random_shape, wall
 from .textures import SIDE, random_tile
 
 Array = NDArray[np.float64]
@@ -37,6 +37,12 @@ class Sample:
     span: tuple[float, float]
 
 
+SHINING = 0.25
+"""Share of the surfaces that mirror what surrounds the scene: they look different from everywhere."""
+STANDING = 0.5
+"""Share of the posed scenes in which one body stands on the ground amid the cameras."""
+
+
 class Tiles:
     """A stock of texture tiles: a tile costs more to make than to look at."""
 
@@ -49,8 +55,10 @@ class Tiles:
         tiles = np.empty((count, SIDE, SIDE, 3), np.uint8)
         for out, n in zip(tiles, random.integers(0, len(self.stock), count), strict=True):
             tile = self.stock[n][..., random.permutation(3)]
-            low, high = np.sort(random.uniform(0, 255, 2)) if random.random() < 0.3 else (0, 255)
-            out[:] = low + tile.astype(np.float32) * ((high - low) / 255)
+            out[:] = tile
+            if random.random() < 0.3:
+                low, high = np.sort(random.uniform(0, 255, 2))
+                out[:] = low + tile.astype(np.float32) * np.float32((high - low) / 255)
         return tiles
 
 
@@ -79,9 +87,9 @@ def _stage(random: Random, focal: float, size: tuple[int, int], near: float, far
         radius = min(radius, 0.45 * depth / stretch.max())
         shapes.append(random_shape(random, held_out).placed(radius * stretch, random_rotation(random), np.array([*middle, depth])))
     if random.random() < 0.6:
-        ground = wall(12 * far, 12 * far, (random.uniform(20, 200),) * 2)
+        flat = wall(12 * far, 12 * far, (random.uniform(20, 200),) * 2)
         turn = euler_to_rotation(np.pi / 2 + random.normal(0, 0.06), 0, random.normal(0, 0.06))
-        shapes.append(ground.placed(1.0, turn, np.array([0, random.uniform(0.3, 1.2) * half[1] * far, far])))
+        shapes.append(flat.placed(1.0, turn, np.array([0, random.uniform(0.3, 1.2) * half[1] * far, far])))
     back = far * random.uniform(1.05, 2.0)
     tilt = euler_to_rotation(random.normal(0, 0.25), random.normal(0, 0.4), 0)
     shapes.append(wall(14 * far, 14 * far, (random.uniform(14, 160),) * 2).placed(1.0, tilt, np.array([0, 0, back])))
@@ -92,8 +100,8 @@ def _stage(random: Random, focal: float, size: tuple[int, int], near: float, far
     return shapes
 
 
-def _photograph(random: Random, shapes: list[Shape], cameras: list[Camera], tiles: Tiles) -> tuple[list[NDArray[np.uint8]], list[Array]]:
-    """Each camera's image and depth."""
+def _photograph(random: Random, shapes: list[Shape], cameras: list[Camera], tiles: Tiles) -> tuple[NDArray[np.uint8], list[Array]]:
+    """Each camera's image and depth; the last texture is what surrounds the scene."""
     first = np.cumsum([0, *(len(s.vertices) for s in shapes)])
     vertices = np.concatenate([s.vertices for s in shapes])
     faces = np.concatenate([s.faces + np.uint32(n) for s, n in zip(shapes, first[:-1], strict=True)])
@@ -101,20 +109,18 @@ def _photograph(random: Random, shapes: list[Shape], cameras: list[Camera], tile
     stretch = np.exp(random.uniform(np.log(0.4), np.log(2.5), len(shapes)))
     uv = np.concatenate([s.uv * k for s, k in zip(shapes, stretch, strict=True)]).astype(np.float32)
     normals = np.concatenate([s.normals for s in shapes]).astype(np.float32)
-    gloss = np.zeros((len(shapes), 4), np.float32)
+    gloss = np.zeros((len(shapes), 5), np.float32)
     gloss[:, 0] = random.uniform(0.25, 0.7)
     gloss[:, 1] = 1.15 - gloss[:, 0]
     gloss[:, 2] = np.where(random.random(len(shapes)) < 0.35, random.uniform(0, 0.6, len(shapes)), 0)
-    gloss[:, 3] = np.exp(random.uniform(np.log(5), np.log(100), len(shapes)))
-    textures = tiles.draw(random, len(shapes))
+    gloss[:, 3] = np.exp(random.uniform(np.log(5), np.log(400), len(shapes)))
+    gloss[:, 4] = np.where(random.random(len(shapes)) < SHINING, random.uniform(0.03, 0.4, len(shapes)), 0)
+    textures = tiles.draw(random, len(shapes) + 1)
     lamp = random.normal(0, 1, 3) * np.array([3, 2, 1]) - np.array([0, 3, 3])
-    images, depths = [], []
-    for camera in cameras:
-        p = np.ascontiguousarray(camera.projection)
-        image = _core.shade(vertices, faces, uv, normals, materials, textures, gloss, p, lamp.tolist(), camera.width, camera.height, 2)
-        images.append(image)
-        depths.append(_core.rasterize(vertices, faces, p, camera.width, camera.height)[0])
-    return images, depths
+    p = np.stack([c.projection for c in cameras])
+    width, height = cameras[0].width, cameras[0].height
+    images = _core.shade(vertices, faces, uv, normals, materials, textures, gloss, p, lamp.tolist(), width, height, 2)
+    return images, [_core.rasterize(vertices, faces, q, width, height)[0] for q in p]
 
 
 def _visible(depth: Array, reference: Camera, other: Array, source: Camera) -> NDArray[np.bool_]:
@@ -140,11 +146,11 @@ def random_pair(
     *,
     floating: bool = True,
     wide: bool = True,
-) -> Sample:
-    """A rectified pair, left image first. The baseline is 1 over the focal length: inverse depth is disparity in pixels.
+) -> list[Sample]:
+    """A rectified pair, left image first, and the same pair in a mirror, where right and left change places.
 
-    ``max_disparity`` in pixels; by default log-uniform over a decade, or unless ``wide`` over half an octave. ``floating``: with shapes
-    between the camera and the walls.
+    The baseline is 1 over the focal length: inverse depth is disparity in pixels. ``max_disparity`` in pixels; by default log-uniform
+    over a decade, or unless ``wide`` over half an octave. ``floating``: with shapes between the camera and the walls.
     """
     focal = width * random.uniform(0.8, 2.5)
     ends = (9, 90) if wide else (28, 40)
@@ -158,50 +164,116 @@ def random_pair(
     left = _camera(width, height, focal, np.eye(3), np.zeros(3), shift)
     right = _camera(width, height, focal, np.eye(3), np.array([baseline, 0, 0]), shift + error)
     images, depths = _photograph(random, shapes, [left, right], tiles)
-    scale = baseline * focal
-    inverse = np.where(depths[0] > 0, scale / np.maximum(depths[0], 1e-9), 0).astype(np.float32)
-    # In a world where the baseline is 1 / focal the maps are those of a rectified pair.
-    unit = [_camera(width, height, focal, np.eye(3), c, shift) for c in (np.zeros(3), np.array([1 / focal, 0, 0]))]
-    seen = _visible(depths[0], left, depths[1], right)[None]
     photographs = np.stack([through_a_camera(i, random) for i in images])
-    return Sample(photographs, tuple(unit), inverse, seen, (0.0, float(max(inverse.max(), top * 0.7) * random.uniform(1.0, 1.3))))
+    # In a world where the baseline is 1 / focal the maps are those of a rectified pair.
+    unit = tuple(_camera(width, height, focal, np.eye(3), c, shift) for c in (np.zeros(3), np.array([1 / focal, 0, 0])))
+    scale, most = baseline * focal, random.uniform(1.0, 1.3)
+
+    def look(pictures: NDArray[np.uint8], depth: Array, seen: NDArray[np.bool_]) -> Sample:
+        inverse = np.where(depth > 0, scale / np.maximum(depth, 1e-9), 0).astype(np.float32)
+        return Sample(pictures, unit, inverse, seen[None], (0.0, float(max(inverse.max(), top * 0.7) * most)))
+
+    shown = _visible(depths[0], left, depths[1], right), _visible(depths[1], right, depths[0], left)
+    mirrored = np.ascontiguousarray(photographs[::-1, :, ::-1])
+    return [look(photographs, depths[0], shown[0]), look(mirrored, np.ascontiguousarray(depths[1][:, ::-1]), shown[1][:, ::-1])]
+
+
+@dataclass(frozen=True)
+class _Scenery:
+    """What posed views look at: shapes, the point that they turn about, and the axis."""
+
+    shapes: list[Shape]
+    target: Array
+    up: Array
+
+
+def _standing(random: Random, focal: float, size: tuple[int, int], held_out: bool) -> _Scenery:
+    """A body of some shapes on the ground in front of a camera at the origin that looks down on it along z; things and walls around."""
+    pitch, distance = random.uniform(0.0, 0.9), 4.0
+    up = np.array([0, -np.cos(pitch), -np.sin(pitch)])
+    target = np.array([0, 0, distance])
+    radius = distance * min(size) / (2 * focal) * random.uniform(0.35, 0.95)
+    floor = target - up * radius * random.uniform(0.4, 1.0)
+    shapes = []
+    for n in range(int(random.integers(3, 12))):
+        scale = radius * np.exp(random.uniform(np.log(0.4 if n == 0 else 0.12), np.log(0.8))) * np.exp(random.normal(0, 0.3, 3))
+        place = target + random.normal(0, 0.4, 3) * radius
+        shapes.append(random_shape(random, held_out).placed(np.minimum(scale, 1.2 * radius), random_rotation(random), place))
+    across = np.array([[1.0, 0, 0], np.cross(up, [1.0, 0, 0])])
+    for _ in range(int(random.integers(0, 9))):
+        angle, away = random.uniform(-np.pi, np.pi), radius * random.uniform(1.5, 5.0)
+        scale = radius * random.uniform(0.1, 0.7, 3)
+        place = floor + away * (np.array([np.cos(angle), np.sin(angle)]) @ across) + up * scale.min()
+        shapes.append(random_shape(random, held_out).placed(scale, random_rotation(random), place))
+    upright = euler_to_rotation(np.pi / 2 + pitch, 0, 0)
+    side = 30 * distance
+    shapes.append(ground(side, random.uniform(20, 300)).placed(1.0, upright, floor))
+    for _ in range(int(random.integers(1, 4))):
+        turn = euler_to_rotation(pitch, 0, 0) @ euler_to_rotation(0, random.uniform(-np.pi, np.pi), 0)
+        away = max(6 * radius, distance * random.uniform(1.3, 4.0))
+        shapes.append(wall(side, side, (random.uniform(14, 160),) * 2).placed(1.0, turn, target + turn[:, 2] * away))
+    return _Scenery(shapes, target, up)
+
+
+def _around(axis: Array, angle: float) -> Array:
+    """The rotation by an angle about a unit axis."""
+    return np.asarray(cv2.Rodrigues(axis * angle)[0])
 
 
 def random_views(
     random: Random, tiles: Tiles, views: int = 3, width: int = 256, height: int = 192, *, floating: bool = True, wide: bool = True
-) -> Sample:
-    """Posed views around a scene, neighbours up to 40 degrees apart, or unless ``wide`` up to 8."""
+) -> list[Sample]:
+    """Posed views of a scene, neighbours up to 45 degrees apart, or unless ``wide`` up to 8: two of them in turn are the reference.
+
+    Half of the scenes are of floating shapes, half of a body that stands on the ground amid the cameras.
+    """
     focal = width * random.uniform(0.8, 2.2)
-    near, far = 2.0, 2.0 * np.exp(random.uniform(np.log(1.4), np.log(4)))
-    shapes = _stage(random, focal, (width, height), near, far, tiles.held_out, floating)
-    target = np.array([0, 0, near * (far / near) ** random.uniform(0.2, 0.6)])
-    reference = _camera(width, height, focal, np.eye(3), np.zeros(3), random.normal(0, 0.03, 2) * width)
-    cameras = [reference]
+    standing = floating and random.random() < STANDING
+    if standing:
+        scenery = _standing(random, focal, (width, height), tiles.held_out)
+    else:
+        near, far = 2.0, 2.0 * np.exp(random.uniform(np.log(1.4), np.log(4)))
+        shapes = _stage(random, focal, (width, height), near, far, tiles.held_out, floating)
+        scenery = _Scenery(shapes, np.array([0, 0, near * (far / near) ** random.uniform(0.2, 0.6)]), np.array([0.0, -1, 0]))
+    target = scenery.target
+    cameras = [_camera(width, height, focal, np.eye(3), np.zeros(3), random.normal(0, 0.03, 2) * width)]
     widest = np.exp(random.uniform(np.log(3), np.log(40 if wide else 8)))
+    if wide and random.random() < 0.4:
+        widest = random.uniform(18, 45)
     for _ in range(views - 1):
         angle, around = np.radians(widest * random.uniform(0.5, 1.0)), random.normal(0, 0.4) + random.choice([0, np.pi])
-        turn = np.array([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), -np.cos(angle)])
+        if standing:
+            tilt = _around(np.array([1.0, 0, 0]), angle * np.sin(around))
+            turn = _around(scenery.up, angle * np.cos(around)) @ tilt @ np.array([0, 0, -1.0])
+        else:
+            turn = np.array([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), -np.cos(angle)])
         center = target + turn * np.linalg.norm(target) * random.uniform(0.85, 1.2)
         aim = target + random.normal(0, 0.06, 3) * target[2]
         rotation = _towards(center, aim, random.normal(0, 0.08))
         cameras.append(_camera(width, height, focal * random.uniform(0.9, 1.1), rotation, center, random.normal(0, 0.03, 2) * width))
-    images, depths = _photograph(random, shapes, cameras, tiles)
-    inverse = np.where(depths[0] > 0, 1 / np.maximum(depths[0], 1e-9), 0).astype(np.float32)
-    known = inverse[inverse > 0]
-    low, high = (float(np.quantile(known, q)) for q in (0.005, 0.995)) if len(known) else (0.1, 1.0)
-    low, high = low * random.uniform(0.5, 1.0), high * random.uniform(1.0, 1.4)
-    seen = np.stack([_visible(depths[0], reference, d, c) for d, c in zip(depths[1:], cameras[1:], strict=True)])
+    images, depths = _photograph(random, scenery.shapes, cameras, tiles)
     photographs = np.stack([through_a_camera(i, random) for i in images])
-    return Sample(photographs, tuple(cameras), inverse, seen, (low, high))
+    less, more = random.uniform(0.5, 1.0), random.uniform(1.0, 1.4)
+
+    def look(reference: int) -> Sample:
+        order = [reference, *(k for k in range(views) if k != reference)]
+        depth = depths[reference]
+        inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0).astype(np.float32)
+        known = inverse[inverse > 0]
+        low, high = (float(np.quantile(known, q)) for q in (0.005, 0.995)) if len(known) else (0.1, 1.0)
+        seen = np.stack([_visible(depth, cameras[reference], depths[k], cameras[k]) for k in order[1:]])
+        return Sample(photographs[order], tuple(cameras[k] for k in order), inverse, seen, (low * less, high * more))
+
+    return [look(0), look(int(random.integers(1, views)))]
 
 
-def contact_sheet(seed: int, held_out: bool, rows: int = 6) -> tuple[NDArray[np.uint8], float]:
+def contact_sheet(seed: int, held_out: bool, rows: int = 8) -> tuple[NDArray[np.uint8], float]:
     """Pairs and posed views, a sample a row: the images, the inverse depth, what the first source sees; and samples a second."""
     random = np.random.default_rng(seed)
     tiles = Tiles(random, held_out)
     started = time.perf_counter()
-    samples = [(random_pair if n % 2 else random_views)(random, tiles) for n in range(rows)]
-    speed = rows / (time.perf_counter() - started)
+    samples = [s for n in range(rows // 2) for s in (random_pair if n % 2 else random_views)(random, tiles)]
+    speed = len(samples) / (time.perf_counter() - started)
     lines = []
     for sample in samples:
         low, high = sample.span

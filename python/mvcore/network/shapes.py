@@ -154,6 +154,14 @@ def wall(width: float, height: float, tiles: tuple[float, float]) -> Shape:
     return _from_grid(np.stack([s, t, np.zeros_like(s)], -1), tiles)
 
 
+def ground(side: float, tiles: float) -> Shape:
+    """A flat square in the plane z = 0 whose cells are small around its middle, where cameras stand close to it."""
+    line = np.linspace(-1, 1, 61) ** 3
+    s, t = np.meshgrid(line * side / 2, line * side / 2, indexing="ij")
+    shape = _from_grid(np.stack([s, t, np.zeros_like(s)], -1))
+    return Shape(shape.vertices, shape.faces, shape.normals, shape.vertices[:, :2] * (tiles / side))
+
+
 TRAINING: tuple[Callable[[Random], Shape], ...] = (_superquadric, _noisy_sphere, _rod, _box, _cone, _sheet, _card)
 HELD_OUT: tuple[Callable[[Random], Shape], ...] = (_torus, _spring, _star_prism)
 

@@ -29,8 +29,9 @@ class Target:
             size = (0.75 if n == 0 else random.uniform(0.25, 0.55)) * np.exp(random.normal(0, 0.25, 3))
             place = np.zeros(3) if n == 0 else random.normal(0, 0.45, 3)
             self.shapes.append(random_shape(random, held_out).placed(np.minimum(size, 1.0), random_rotation(random), place))
-        self.tiles = np.stack([random_tile(random, held_out) for _ in self.shapes])
-        self.gloss = np.tile(np.array([0.45, 0.7, 0.15, 30.0], np.float32), (len(self.shapes), 1))
+        tiles = [random_tile(random, held_out) for _ in self.shapes]
+        self.tiles = np.stack([*tiles, tiles[0]])
+        self.gloss = np.tile(np.array([0.45, 0.7, 0.15, 30.0, 0.0], np.float32), (len(self.shapes), 1))
 
     def photograph(self, azimuth: float, elevation: float, random: np.random.Generator, size: int = SIZE) -> NDArray[np.uint8]:
         """(size, size, 3) uint8 from a side given in radians, on a background, with light and camera drawn from ``random``."""
@@ -49,7 +50,7 @@ class Target:
         normals = np.concatenate([s.normals for s in self.shapes]).astype(np.float32)
         p = np.ascontiguousarray(camera.projection)
         lamp = (random.normal(0, 2, 3) + np.array([0, 0, 5])).tolist()
-        image = _core.shade(vertices, faces, uv, normals, materials, self.tiles, self.gloss, p, lamp, 2 * size, 2 * size, 1)
+        image = _core.shade(vertices, faces, uv, normals, materials, self.tiles, self.gloss, p[None], lamp, 2 * size, 2 * size, 1)[0]
         inside = _core.rasterize(vertices, faces, p, 2 * size, 2 * size)[0] > 0
         behind = cv2.resize(octaves(random), (2 * size, 2 * size))
         colours = random.uniform(0, 255, (2, 3))

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from .logs import cut_log, log_row
 from .losses import loss
 from .match import RECTIFIED, padded, planes_for
 from .model import DisparityNet, Prediction
-from .weights import save_weights
+from .weights import load_into, notes_of, save_weights
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Training:
     """A training run.
 
     steps : batches in all. rate : AdamW's, after ``warmup`` steps, falling linearly to zero over the last ``decay`` share.
-    every : steps between validations and checkpoints. hours : stop after this long, with a checkpoint.
+    every : steps between validations and checkpoints. workers : processes that render.
+    hours : the training ends after this long if not by its steps, and the rate falls to zero by then; such a run is not repeatable.
     """
 
     steps: int = 10_000
@@ -40,7 +42,7 @@ class Training:
     windowed: bool = True
     rate: float = 1e-3
     warmup: int = 200
-    decay: float = 0.4
+    decay: float = 0.7
     every: int = 250
     averaging: float = 0.998
     hours: float | None = None
@@ -48,6 +50,8 @@ class Training:
     recipe: Recipe = field(default_factory=Recipe)
     middlebury: str | None = None
     """Folder of Middlebury scenes to validate on as well."""
+    start: str | None = None
+    """Weights to begin from, a safetensors file of the same build; by default from nothing."""
 
 
 class _Batches(Dataset[Batch]):
@@ -67,7 +71,20 @@ def _stream(recipe: Recipe, first: int, steps: int, workers: int) -> Iterator[Ba
         return (make_batch(recipe, n) for n in numbers)
     spawned = {"multiprocessing_context": "spawn", "prefetch_factor": 4}
     loader: DataLoader[Batch] = DataLoader(_Batches(recipe, steps), batch_size=None, sampler=list(numbers), num_workers=workers, **spawned)  # type: ignore[arg-type]
-    return iter(loader)
+    if workers == 1:
+        return iter(loader)
+    # Many processes with as many threads each would get in each other's way; they take this from us when they start.
+    before = os.environ.get(THREADS)
+    os.environ[THREADS] = "1"
+    try:
+        return iter(loader)
+    finally:
+        os.environ.pop(THREADS)
+        if before is not None:
+            os.environ[THREADS] = before
+
+
+THREADS = "RAYON_NUM_THREADS"
 
 
 def precision(device: torch.device) -> contextlib.AbstractContextManager[Any]:
@@ -92,16 +109,19 @@ class _Average:
     @torch.no_grad()
     def update(self, net: nn.Module, step: int) -> None:
         keep = min(self.keep, (1 + step) / (10 + step))
-        for mine, theirs in zip(self.net.state_dict().values(), net.state_dict().values(), strict=True):
-            if mine.dtype.is_floating_point:
-                mine.lerp_(theirs, 1 - keep)
-            else:
-                mine.copy_(theirs)
+        both = [(m, t) for m, t in zip(self.net.state_dict().values(), net.state_dict().values(), strict=True)]
+        mine, theirs = (list(x) for x in zip(*(p for p in both if p[0].dtype.is_floating_point), strict=True))
+        torch._foreach_lerp_(mine, theirs, 1 - keep)
+        for m, t in both:
+            if not m.dtype.is_floating_point:
+                m.copy_(t)
 
 
-def _rate(training: Training, step: int) -> float:
-    left = (training.steps - step) / max(1.0, training.decay * training.steps)
-    return training.rate * min(1.0, (step + 1) / training.warmup, left)
+def _rate(training: Training, step: int, seconds: float) -> float:
+    done = step / training.steps
+    if training.hours is not None:
+        done = min(1.0, max(done, seconds / (3600 * training.hours)))
+    return training.rate * min(1.0, (step + 1) / training.warmup, (1 - done) / max(training.decay, 1e-6))
 
 
 def train_disparity(training: Training, out: Path, device: str = "cpu", report: Any = print, stop_after: int | None = None) -> Path:
@@ -114,21 +134,24 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     where = torch.device(device)
     torch.manual_seed(training.recipe.seed)
     net = DisparityNet(training.preset, training.hourglasses, training.groups, training.windowed).to(where).train()
+    if training.start:
+        load_into(net, notes_of(Path(training.start))[1], Path(training.start))
     average = _Average(net, training.averaging)
-    optimiser = torch.optim.AdamW(net.parameters(), training.rate, weight_decay=1e-4)
+    optimiser = torch.optim.AdamW(net.parameters(), training.rate, weight_decay=1e-4, fused=where.type == "cuda")
     pairs = find_items(f"middlebury:{training.middlebury}") if training.middlebury else []
-    step, best, last = 0, float("inf"), out / "last.pt"
+    step, best, before, last = 0, float("inf"), 0.0, out / "last.pt"
     if last.exists():
         state = torch.load(last, map_location=where, weights_only=True)
         net.load_state_dict(state["net"])
         average.net.load_state_dict(state["average"])
         optimiser.load_state_dict(state["optimiser"])
-        step, best = state["step"], state["best"]
+        step, best, before = state["step"], state["best"], state["seconds"]
         cut_log(out / "log.csv", step)
     started, seen, total, skipped = time.perf_counter(), 0, 0.0, 0
     for batch in _stream(training.recipe, step, training.steps, training.workers):
+        spent = before + time.perf_counter() - started
         for group in optimiser.param_groups:
-            group["lr"] = _rate(training, step)
+            group["lr"] = _rate(training, step, spent)
         value = _step(net, optimiser, _to(batch, where), where)
         if value is None:
             skipped += 1
@@ -136,11 +159,11 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
             total, seen = total + value, seen + 1
         step += 1
         average.update(net, step)
-        timed_out = training.hours is not None and time.perf_counter() - started > training.hours * 3600
+        timed_out = training.hours is not None and spent > training.hours * 3600
         if step % training.every == 0 or step == training.steps or timed_out:
-            figures = validate(average.net, replace(training.recipe, data=()), where)
+            figures = validate(average.net, training.recipe.seed, where)
             figures |= validate_pairs(average.net, pairs, where) if pairs else {}
-            row = {"step": step, "loss": total / max(seen, 1), "skipped": skipped, "seconds": time.perf_counter() - started, **figures}
+            row = {"step": step, "loss": total / max(seen, 1), "skipped": skipped, "seconds": spent, **figures}
             log_row(out / "log.csv", row)
             report(" ".join(f"{k} {v:.4g}" for k, v in row.items()))
             total, seen, skipped = 0.0, 0, 0
@@ -148,7 +171,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
                 best = figures["pair_bad1"] + figures["views_bad1"]
                 save_weights(average.net, out / "best.safetensors", {"step": str(step)})
             state = {"net": net.state_dict(), "average": average.net.state_dict(), "optimiser": optimiser.state_dict()}
-            torch.save({**state, "step": step, "best": best}, out / "last.tmp")
+            torch.save({**state, "step": step, "best": best, "seconds": spent}, out / "last.tmp")
             os.replace(out / "last.tmp", last)
         if timed_out or step == stop_after:
             break
@@ -187,15 +210,21 @@ def validate_pairs(net: DisparityNet, items: Sequence[Item], device: torch.devic
     return {"middlebury_bad2": float(np.mean(shares)), "middlebury_epe": float(np.mean(errors))}
 
 
+@lru_cache(maxsize=4)
+def _held_out(seed: int, pairs: float, count: int) -> list[Batch]:
+    """Batches of held-out families, of the same size whatever is trained on."""
+    recipe = Recipe(seed=seed + 1_000_000, held_out=True, pairs=pairs)
+    return [replace(make_batch(recipe, n), planes=32) for n in range(count)]
+
+
 @torch.no_grad()
-def validate(net: DisparityNet, recipe: Recipe, device: torch.device, batches: int = 12) -> dict[str, float]:
+def validate(net: DisparityNet, seed: int, device: torch.device, batches: int = 12) -> dict[str, float]:
     """On held-out shapes and textures: mean error and shares of pixels worse than one plane (of 32), pairs and posed views apart."""
     figures: dict[str, float] = {}
     for name, pairs in (("pair", 1.0), ("views", 0.0)):
-        held_out = replace(recipe, seed=recipe.seed + 1_000_000, held_out=True, pairs=pairs)
         errors, pixels = [], []
-        for n in range(batches):
-            batch = _to(replace(make_batch(held_out, n), planes=32), device)
+        for batch in _held_out(seed, pairs, batches):
+            batch = _to(batch, device)
             with precision(device):
                 found: Prediction = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
             known = (batch.inverse > 0) & (batch.inverse >= batch.low[:, None, None]) & (batch.inverse <= batch.high[:, None, None])

@@ -3,7 +3,9 @@
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::{Error, Result};
 use ndarray::{Array, Dimension, IntoDimension};
-use numpy::{Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::{
+    Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+};
 use pyo3::exceptions::{PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyAnyMethods;
@@ -30,6 +32,13 @@ pub fn slice<'a, T: Element, D: Dimension>(
 ) -> PyResult<&'a [T]> {
     let values = array.as_slice().ok().filter(|_| array.is_c_contiguous());
     values.ok_or_else(|| PyValueError::new_err(format!("{argument}: expected a C-contiguous array")))
+}
+
+/// A picture (h, w, 3) as a raster of its bytes, 3 w a row.
+pub fn picture<'a>(array: &'a PyReadonlyArray3<'_, u8>, argument: &'static str) -> PyResult<Raster<'a, u8>> {
+    let shape = array.as_array().dim();
+    Raster::new(slice(array, argument)?, shape.1 * shape.2, shape.0, argument)
+        .map_err(|error| to_python(array.py(), &error))
 }
 
 /// A 2-D array as a raster.

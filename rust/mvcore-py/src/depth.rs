@@ -1,8 +1,9 @@
 //! Bindings of the depth kernels.
 
-use crate::convert::{array, map_of, raster, rasters, run, slice, sources};
+use crate::convert::{array, map_of, picture, raster, rasters, run, slice, sources};
 use mvcore::aggregate::Penalties;
 use mvcore::correlate::{Features, Planes, Visibility};
+use mvcore::median::MedianParams;
 use mvcore::slanted::{Hypothesis, RefineParams, SourceSurface};
 use numpy::{
     PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArrayDyn,
@@ -58,6 +59,27 @@ pub fn expect<'py>(
     let (expected, confidence) = (slice(&expected, "expected")?, slice(&confidence, "confidence")?);
     let values = costs.as_slice_mut().map_err(|_| PyValueError::new_err("costs: expected a C-contiguous array"))?;
     run(py, || mvcore::expect::expect(values, planes, expected, confidence, weight, reach))
+}
+
+/// Values (h, w) replaced by their weighted median under a guide (h, w, 3), where they differ by more than the slack or are doubtful.
+#[pyfunction]
+#[pyo3(signature = (values, guide, doubtful, *, radius, step, colour, distance, slack))]
+pub fn weighted_median<'py>(
+    py: Python<'py>,
+    values: PyReadonlyArray2<'py, f32>,
+    guide: PyReadonlyArray3<'py, u8>,
+    doubtful: PyReadonlyArray2<'py, u8>,
+    radius: usize,
+    step: usize,
+    colour: f32,
+    distance: f32,
+    slack: f32,
+) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    let (values, doubtful) = (raster(&values, "values")?, raster(&doubtful, "doubtful")?);
+    let guide = picture(&guide, "guide")?;
+    let params = MedianParams { radius, step, colour, distance, slack };
+    let found = run(py, || mvcore::median::weighted_median(values, guide, doubtful, &params))?;
+    array(py, found, [values.height, values.width])
 }
 
 /// (D, h, w, G) correlations; planes (D,) or (D, h, w).

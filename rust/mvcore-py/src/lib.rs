@@ -13,7 +13,7 @@ use pyo3::prelude::*;
 #[pymodule]
 mod _core {
     #[pymodule_export]
-    use crate::depth::{aggregate, correlate, expect, refine, sweep};
+    use crate::depth::{aggregate, correlate, expect, refine, sweep, weighted_median};
     #[pymodule_export]
     use crate::files::{encode_png, read_obj};
     #[pymodule_export]

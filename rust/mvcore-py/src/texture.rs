@@ -5,9 +5,9 @@ use mvcore::atlas::Source;
 use mvcore::mesh::Mesh;
 use mvcore::raster::Raster;
 use mvcore::select_views::{Photo, Rating, SelectParams};
-use mvcore::shade::{Shot, Surface};
+use mvcore::shade::{Shots, Surface};
 use numpy::{
-    PyArray1, PyArray2, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
+    PyArray1, PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
     PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
@@ -124,7 +124,7 @@ pub fn build_atlas<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (vertices, faces, uv, normals, materials, textures, gloss, matrix, lamp, width, height, samples = 2))]
+#[pyo3(signature = (vertices, faces, uv, normals, materials, textures, gloss, matrices, lamp, width, height, samples = 2))]
 pub fn shade<'py>(
     py: Python<'py>,
     vertices: PyReadonlyArray2<'py, f64>,
@@ -134,21 +134,22 @@ pub fn shade<'py>(
     materials: PyReadonlyArray1<'py, u16>,
     textures: PyReadonlyArray4<'py, u8>,
     gloss: PyReadonlyArray2<'py, f32>,
-    matrix: PyReadonlyArray2<'py, f64>,
+    matrices: PyReadonlyArray3<'py, f64>,
     lamp: [f64; 3],
     width: usize,
     height: usize,
     samples: usize,
-) -> PyResult<Bound<'py, PyArray3<u8>>> {
-    let ((v, f), projection) = (mesh(&vertices, &faces)?, projection(&matrix)?);
+) -> PyResult<Bound<'py, PyArray4<u8>>> {
+    let (v, f) = mesh(&vertices, &faces)?;
     let size = textures.shape()[1];
     if uv.shape()[1] != 2
         || normals.shape()[1] != 3
-        || gloss.shape()[1] != 4
+        || gloss.shape()[1] != 5
+        || matrices.shape()[1..] != [3, 4]
         || textures.shape()[1..] != [size, size, 3]
     {
         return Err(PyValueError::new_err(
-            "uv, normals, gloss, textures: expected shapes (n, 2), (n, 3), (m, 4), (m, s, s, 3)",
+            "uv, normals, gloss, textures, matrices: expected shapes (n, 2), (n, 3), (m, 5), (m + 1, s, s, 3), (v, 3, 4)",
         ));
     }
     let surface = Surface {
@@ -157,9 +158,10 @@ pub fn shade<'py>(
         materials: slice(&materials, "materials")?,
         textures: slice(&textures, "textures")?,
         size,
-        gloss: slice(&gloss, "gloss")?.as_chunks::<4>().0,
+        gloss: slice(&gloss, "gloss")?.as_chunks::<5>().0,
     };
-    let shot = Shot { projection, lamp, width, height, samples };
-    let image = run(py, || mvcore::shade::shade(Mesh::new(v, f)?, surface, &shot))?;
-    array(py, image, [height, width, 3])
+    let projections = slice(&matrices, "matrices")?.as_chunks::<12>().0;
+    let shots = Shots { projections, lamp, width, height, samples };
+    let images = run(py, || mvcore::shade::shade(Mesh::new(v, f)?, surface, &shots))?;
+    array(py, images, [projections.len(), height, width, 3])
 }
