@@ -134,6 +134,7 @@ const FUSION: FusionParams = FusionParams {
     smoothing: 0.0,
     hull_tolerance: 0.05,
     complete: false,
+    hollow: true,
     max_memory: 4 << 30,
 };
 

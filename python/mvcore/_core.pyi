@@ -100,6 +100,7 @@ def fuse(
     smoothing: float,
     hull_tolerance: float,
     complete: bool = ...,
+    hollow: bool = ...,
     max_memory: int,
 ) -> tuple[_U32, _F32]: ...
 def carve(

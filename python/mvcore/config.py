@@ -63,7 +63,7 @@ class DepthConfig:
     """Rounds of slanted refinement at the sweep's scale, where they are cheap."""
     rounds: int = 1
     """Rounds at each finer scale."""
-    network_weight: float = 20.0
+    network_weight: float = 12.0
     """With the network: cost units, at full confidence, of a plane far from what it found."""
     network_reach: float = 6.0
     """Planes at which that cost stops growing."""

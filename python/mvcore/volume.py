@@ -171,8 +171,11 @@ class _Fusion:
         nothing = np.zeros((0, 3), np.uint32), np.zeros((0, SIDE, SIDE, SIDE), np.float32)
         return Volume(self.bounds[0] - 2 * voxel, voxel, (nx, ny, nz), *nothing)
 
-    def run(self, grid: Volume, tile: list[list[int]] | None = None) -> Volume:
-        """The field, or the blocks from tile[0] up to tile[1]; MemoryError beyond ``max_memory``."""
+    def run(self, grid: Volume, tile: list[list[int]] | None = None, hollow: bool = False) -> Volume:
+        """The field, or the blocks from tile[0] up to tile[1]; MemoryError beyond ``max_memory``.
+
+        ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes.
+        """
         config = self.config
         coords, values = _core.fuse(
             grid.origin.tolist(),
@@ -191,6 +194,7 @@ class _Fusion:
             smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
             hull_tolerance=config.hull_tolerance,
             complete=self.complete,
+            hollow=hollow,
             max_memory=config.max_memory,
         )
         return replace(grid, coords=coords, values=values)
@@ -200,7 +204,7 @@ class _Fusion:
         # A block more on every side for the smoothing, and one at the far side, of which the last cells take their samples.
         wide = [np.maximum(low - 1, 0).tolist(), np.minimum(high + 2, grid.blocks).tolist()]
         try:
-            found = self.run(grid, wide)
+            found = self.run(grid, wide, hollow=True)
         except MemoryError as error:
             axis = int((high - low).argmax())
             if high[axis] - low[axis] < 2:
@@ -267,7 +271,8 @@ def fuse_tiles(
     windows: Sequence[Window] | None = None,
     found: Sequence[NDArray[np.uint8]] | None = None,
 ) -> Iterator[Volume]:
-    """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out.
+    """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out. Blocks deep
+    inside the masks' hull are left out.
 
     Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone: `mvcore.surface.isosurface`
     joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and

@@ -38,7 +38,7 @@ pub fn consistency<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, complete = false, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -57,6 +57,7 @@ pub fn fuse<'py>(
     smoothing: f32,
     hull_tolerance: f32,
     complete: bool,
+    hollow: bool,
     max_memory: usize,
 ) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray4<f32>>)> {
     let (depths, weights) = (rasters(&depths, "depths")?, rasters(&weights, "weights")?);
@@ -85,6 +86,7 @@ pub fn fuse<'py>(
         smoothing,
         hull_tolerance,
         complete,
+        hollow,
         max_memory,
     };
     let volume = run(py, || {

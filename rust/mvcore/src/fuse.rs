@@ -6,16 +6,17 @@
 //!
 //! Voxels farther than τ in front of a surface get +τ from that view: free space carves what other views put there by mistake.
 //! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid; or they only
-//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Curless and
-//! Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
+//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Deep inside a hull
+//! that cuts, nothing is observed and no surface passes: blocks there may be left out, so that the cost grows with the surface, not
+//! with the room in it. Curless and Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
 //! order: the same bytes for any thread count.
 
 use crate::error::{Error, Result, require};
 use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
-use crate::hull::{SoftSilhouette, cut_block, mark_hull, restrict_to_hull};
+use crate::hull::{SoftSilhouette, cut_block, deep_inside, mark_hull, restrict_to_hull};
 use crate::memory::zeroed;
 use crate::raster::Raster;
-use crate::smooth::smooth;
+use crate::smooth::{Beyond, smooth};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -62,6 +63,8 @@ pub struct FusionParams {
     pub hull_tolerance: f32,
     /// Silhouettes complete what the depth maps leave open; they cut nothing.
     pub complete: bool,
+    /// Blocks deep inside a hull that cuts are left out.
+    pub hollow: bool,
     /// Most bytes of the volume.
     pub max_memory: usize,
 }
@@ -119,13 +122,19 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
         Hull::Cuts => restrict_to_hull(&grid, &tile, &silhouettes, params.hull_tolerance, &flags),
         Hull::Completes => mark_hull(&grid, &tile, &silhouettes, params.hull_tolerance, params.truncation, &flags),
     }
-    let map = BlockMap::from_flags(tile, flags.iter().map(|f| f.load(Ordering::Relaxed)));
+    let tiles: Vec<Tiles> = views.par_iter().map(|v| Tiles::of(v.depth)).collect();
+    let mut flags: Vec<bool> = flags.into_iter().map(AtomicBool::into_inner).collect();
+    let mut inside = vec![false; count];
+    if hull == Hull::Cuts && params.hollow {
+        inside = deep_blocks(&grid, &tile, views, &tiles, &silhouettes, params, &flags);
+        flags = (0..count).into_par_iter().map(|n| flags[n] && !amid(&tile, n, &inside)).collect();
+    }
+    let map = BlockMap::from_flags(tile, flags.into_iter());
     let needed = map.coords.len() * BLOCK * VOXEL_BYTES + table;
     if needed > params.max_memory {
         return Err(Error::OutOfMemory { what: "volume", needed, allowed: params.max_memory });
     }
     let mut values = zeroed::<f32>(map.coords.len() * BLOCK);
-    let tiles: Vec<Tiles> = views.par_iter().map(|v| Tiles::of(v.depth)).collect();
     values.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).for_each(|(out, at)| {
         let cut = |out: &mut [f32]| {
             cut_block(&grid, *at, &silhouettes, params.hull_tolerance, params.truncation, out);
@@ -147,7 +156,8 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
     });
     if params.smoothing > 0.0 {
         // With silhouettes what no block covers is outside the hull.
-        values = smooth(&values, &map, params.smoothing, (hull == Hull::Cuts).then_some(1.0));
+        let beyond = if hull == Hull::Cuts { Beyond::Outside(&inside) } else { Beyond::Unknown };
+        values = smooth(&values, &map, params.smoothing, beyond);
     }
     Ok(Volume { map, values })
 }
@@ -158,6 +168,38 @@ enum Hull {
     Unknown,
     Cuts,
     Completes,
+}
+
+/// Of the flagged blocks, those that no depth map says anything of and that lie deep inside the hull: they are solid throughout.
+fn deep_blocks(
+    grid: &Grid,
+    tile: &Tile,
+    views: &[FusionView],
+    tiles: &[Tiles],
+    silhouettes: &[SoftSilhouette],
+    params: &FusionParams,
+    flags: &[bool],
+) -> Vec<bool> {
+    let solid = |(n, &flag): (usize, &bool)| {
+        let at = tile.block(n).map(|v| v as u32);
+        let unseen = |(view, tiles): (&FusionView, &Tiles)| {
+            Stepper::new(grid, at, &view.projection).misses(tiles, params.truncation as f32)
+        };
+        flag && views.iter().zip(tiles).all(unseen)
+            && deep_inside(grid, at, silhouettes, params.hull_tolerance, params.truncation)
+    };
+    flags.par_iter().enumerate().map(solid).collect()
+}
+
+/// Whether a block and all 26 around it are solid: no cell of its own or of a neighbour's holds a surface, nor does smoothing reach one.
+fn amid(tile: &Tile, n: usize, solid: &[bool]) -> bool {
+    let at = tile.block(n);
+    solid[n]
+        && (0..27).all(|k| {
+            let step = [k / 9, k / 3 % 3, k % 3];
+            let near = [0, 1, 2].map(|a| (at[a] + step[a]).wrapping_sub(1));
+            tile.index(near).is_some_and(|m| solid[m])
+        })
 }
 
 /// Marks the blocks within τ of a view's surface, walking each pixel's ray.
@@ -415,6 +457,7 @@ mod tests {
         smoothing: 0.0,
         hull_tolerance: 0.0,
         complete: false,
+        hollow: false,
         max_memory: 1 << 30,
     };
 
@@ -466,6 +509,32 @@ mod tests {
         };
         assert!(value(20, 20, 20) < -0.9);
         assert!(value(20, 29, 20) > 0.0); // 0.45 to the side: 6.75 px
+    }
+
+    #[test]
+    fn a_hollow_hull_lacks_its_inside_and_nothing_else() {
+        // A slanted plane is seen through a wide silhouette: solid behind it.
+        let depth: Vec<f32> =
+            (0..64 * 64).map(|i| if i % 64 < 40 { 3.4 + 0.004 * (i % 64) as f32 } else { 0.0 }).collect();
+        let weight = vec![1.0f32; 64 * 64];
+        let outside: Vec<f32> =
+            (0..64 * 64).map(|i| (((i % 64) as f32 - 31.5).hypot((i / 64) as f32 - 31.5)) - 28.0).collect();
+        let view = view(&depth, &weight, Some(&outside));
+        let grid = Grid::new([-1.0; 3], 0.02, [101; 3]).unwrap();
+        let full = FusionParams { truncation: 0.06, smoothing: 1.5, ..PARAMS };
+        let whole = fuse(grid, &[view], &full).unwrap();
+        let hollow = fuse(grid, &[view], &FusionParams { hollow: true, ..full }).unwrap();
+        assert!(hollow.map.coords.len() * 4 < whole.map.coords.len() * 3);
+        for (n, c) in whole.map.coords.iter().enumerate() {
+            let block = &whole.values[n * BLOCK..][..BLOCK];
+            match hollow.map.at(c[0] as usize, c[1] as usize, c[2] as usize) {
+                u32::MAX => assert!(block.iter().all(|&v| v == -1.0), "{c:?}"),
+                slot => {
+                    let same = &hollow.values[slot as usize * BLOCK..][..BLOCK];
+                    assert!(block.iter().zip(same).all(|(a, b)| a.to_bits() == b.to_bits()), "{c:?}");
+                }
+            }
+        }
     }
 
     #[test]

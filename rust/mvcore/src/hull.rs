@@ -66,15 +66,13 @@ fn for_each_block(
     );
 }
 
-/// Raises a block's values, in units of the truncation, to the hull's distance.
-pub fn cut_block(
+/// What the silhouettes say of a whole block, and those of them that must be asked of each of its voxels.
+fn asked<'a, 'b>(
     grid: &Grid,
     at: [u32; 3],
-    views: &[SoftSilhouette],
-    tolerance: f32,
+    views: &'b [SoftSilhouette<'a>],
     truncation: f64,
-    out: &mut [f32],
-) {
+) -> (Vote, Vec<&'b SoftSilhouette<'a>>) {
     let mut vote = Vote { silhouettes: views.len(), ..Vote::default() };
     let mut open = Vec::with_capacity(views.len());
     for view in views {
@@ -88,6 +86,25 @@ pub fn cut_block(
             Answer::Near => open.push(view),
         }
     }
+    (vote, open)
+}
+
+/// Whether a block lies so far inside the hull that [`cut_block`] would leave all of it as it is.
+pub fn deep_inside(grid: &Grid, at: [u32; 3], views: &[SoftSilhouette], tolerance: f32, truncation: f64) -> bool {
+    let (vote, open) = asked(grid, at, views, truncation);
+    open.is_empty() && vote.above <= vote.allowed(vote.seen, tolerance) && vote.enough(vote.seen)
+}
+
+/// Raises a block's values, in units of the truncation, to the hull's distance.
+pub fn cut_block(
+    grid: &Grid,
+    at: [u32; 3],
+    views: &[SoftSilhouette],
+    tolerance: f32,
+    truncation: f64,
+    out: &mut [f32],
+) {
+    let (vote, open) = asked(grid, at, views, truncation);
     // More of them may see it, which allows more to disagree.
     if vote.above > vote.allowed(vote.seen + open.len(), tolerance) {
         out.fill(1.0);

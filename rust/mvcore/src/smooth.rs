@@ -18,17 +18,26 @@ const HALO: usize = 4;
 const FAR_WEIGHT: f32 = 0.1;
 const WIDE: usize = SIDE + 2 * HALO;
 
-/// A Gaussian mean of the known voxels around each known one: normalised convolution, axis by axis. `beyond` fills missing blocks.
-pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Option<f32>) -> Vec<f32> {
+/// What blocks that the map lacks hold.
+#[derive(Debug, Clone, Copy)]
+pub enum Beyond<'a> {
+    /// Nothing is known of them: the surface is open.
+    Unknown,
+    /// 1, outside; but -1, inside, where the flag of the tile's block is set.
+    Outside(&'a [bool]),
+}
+
+/// A Gaussian mean of the known voxels around each known one: normalised convolution, axis by axis.
+pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond) -> Vec<f32> {
     let taps: [f32; 2 * HALO + 1] = std::array::from_fn(|k| (-0.5 * ((k as f32 - HALO as f32) / sigma).powi(2)).exp());
     // Open surfaces have free space on one side and nothing behind: far values must not outweigh the surface's own.
-    let least = if beyond.is_some() { 1.0 } else { FAR_WEIGHT };
+    let least = if matches!(beyond, Beyond::Outside(_)) { 1.0 } else { FAR_WEIGHT };
     let mut out = zeroed::<f32>(values.len());
     out.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).enumerate().for_each_init(
         || vec![[0.0f32; 2]; WIDE * WIDE * WIDE],
         |wide, (slot, (out, at))| {
-            wide.fill(beyond.map_or([0.0; 2], |v| [v, 1.0]));
-            gather(values, map, *at, least, wide);
+            wide.fill(if matches!(beyond, Beyond::Outside(_)) { [1.0, 1.0] } else { [0.0; 2] });
+            gather(values, map, *at, least, beyond, wide);
             smooth_block(wide, &taps, &values[slot * BLOCK..][..BLOCK], out);
         },
     );
@@ -36,15 +45,16 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Option<f32>) -
 }
 
 /// Puts a block with its surroundings into a wide one as (value, 1), and (0, 0) where nothing is known.
-fn gather(values: &[f32], map: &BlockMap, at: [u32; 3], least: f32, wide: &mut [[f32; 2]]) {
+fn gather(values: &[f32], map: &BlockMap, at: [u32; 3], least: f32, beyond: Beyond, wide: &mut [[f32; 2]]) {
     for n in 0..27 {
         let step = [n / 9, n / 3 % 3, n % 3];
         let block = [0, 1, 2].map(|a| (at[a] as usize + step[a]).wrapping_sub(1));
-        let slot = map.at(block[0], block[1], block[2]);
-        if slot == NONE {
-            continue;
-        }
-        let from = &values[slot as usize * BLOCK..][..BLOCK];
+        let Some(index) = map.tile.index(block) else { continue };
+        let from = match (map.slot[index], beyond) {
+            (NONE, Beyond::Outside(inside)) if inside[index] => &[-1.0; BLOCK],
+            (NONE, _) => continue,
+            (slot, _) => &values[slot as usize * BLOCK..][..BLOCK],
+        };
         // In the wide block this neighbour starts at HALO + (step - 1)·SIDE; only what lies inside is copied.
         let range = |a: usize| {
             let start = (HALO + step[a] * SIDE) as i32 - SIDE as i32;
@@ -116,7 +126,7 @@ mod tests {
         let speck = 7 * BLOCK + 3 * 64 + 3 * 8 + 3;
         let unknown = BLOCK + 5;
         (values[speck], values[unknown]) = (-0.9, f32::NAN);
-        let found = smooth(&values, &map, 1.0, None);
+        let found = smooth(&values, &map, 1.0, Beyond::Unknown);
         assert!(found[unknown].is_nan());
         assert!((found[speck] - 3.5 / 16.0).abs() < 0.15, "{}", found[speck]);
         // Away from the speck and the ends of the ramp the slope is kept.
