@@ -15,6 +15,7 @@ use mvcore::grid::Grid;
 use mvcore::holes::close_holes;
 use mvcore::isosurface::{isosurface_dense, isosurface_sparse};
 use mvcore::match_epipolar::{DESCRIPTOR, Features, match_epipolar};
+use mvcore::median::{MedianParams, weighted_median};
 use mvcore::mesh::Mesh;
 use mvcore::nearest::nearest;
 use mvcore::nurbs::{self, Knots, Net};
@@ -97,6 +98,29 @@ fn stereo(c: &mut Criterion) {
     let mut volume = costs.clone();
     let (expected, sure): (Vec<f32>, Vec<f32>) = (0..w * h).map(|i| (disparity(i % w), random.next() as f32)).unzip();
     group.bench_function("expect 1280x960x128", |b| b.iter(|| expect(&mut volume, d, &expected, &sure, 20.0, 4.0)));
+    // A slope with a step every 160 columns, a pixel off the picture's edges, and one pixel in ten wrong.
+    let rgb: Vec<u8> =
+        (0..w * h * 3).map(|i| guide.data[i / 3] / 4 + if i / 3 % w / 160 % 2 == 0 { 20 } else { 160 }).collect();
+    let found: Vec<f32> = (0..w * h)
+        .map(|i| {
+            let step = if (i % w + 1) / 160 % 2 == 0 { 0.0 } else { 12.0 };
+            disparity(i % w) + step + if random.next() < 0.1 { 9.0 * random.next() as f32 } else { 0.0 }
+        })
+        .collect();
+    let doubtful = vec![0; w * h];
+    let rasters = || {
+        let (found, doubtful) =
+            (Raster::new(&found, w, h, "found").unwrap(), Raster::new(&doubtful, w, h, "d").unwrap());
+        (found, Raster::new(&rgb, 3 * w, h, "rgb").unwrap(), doubtful)
+    };
+    let params = MedianParams { radius: 10, step: 2, colour: 10.0, distance: 6.0, slack: 1.0 };
+    group.throughput(Throughput::Elements((w * h) as u64));
+    group.bench_function("weighted median 1280x960, 121 samples", |b| {
+        b.iter(|| {
+            let (found, rgb, doubtful) = rasters();
+            weighted_median(found, rgb, doubtful, &params).unwrap()
+        });
+    });
     group.finish();
 }
 

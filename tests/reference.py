@@ -63,3 +63,27 @@ def carve(origin, voxel, shape, masks, projections, tolerance, least_views):
         seen += inside
         against[inside] += mask[x[inside, 1], x[inside, 0]] == 0
     return ((seen >= least_views) & (against <= tolerance * seen)).reshape(shape)
+
+
+def weighted_median(values, guide, doubtful, radius, step, colour, distance, slack):
+    """Each pixel's median of the window under weights by colour and distance; NaN is unknown."""
+    h, w = values.shape
+    out = values.copy()
+    steps = np.arange(-(radius // step), radius // step + 1) * step
+    for y in range(h):
+        for x in range(w):
+            j, i = (a.ravel() for a in np.meshgrid(y + steps, x + steps, indexing="ij"))
+            inside = (j >= 0) & (j < h) & (i >= 0) & (i < w)
+            j, i = j[inside], i[inside]
+            known = ~np.isnan(values[j, i])
+            j, i = j[known], i[known]
+            if len(j) == 0:
+                continue
+            differ = np.abs(guide[j, i].astype(float) - guide[y, x]).mean(1)
+            weight = np.exp(-differ / colour - np.hypot(j - y, i - x) / distance)
+            order = np.argsort(values[j, i], kind="stable")
+            sums = np.cumsum(weight[order])
+            median = values[j, i][order][np.searchsorted(sums, 0.5 * sums[-1])]
+            if doubtful[y, x] or np.isnan(values[y, x]) or abs(median - values[y, x]) > slack:
+                out[y, x] = median
+    return out
