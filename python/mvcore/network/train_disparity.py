@@ -41,7 +41,7 @@ class Training:
     groups: int = 8
     windowed: bool = True
     rate: float = 1e-3
-    warmup: int = 200
+    warmup: int = 300
     decay: float = 0.7
     every: int = 250
     averaging: float = 0.998
