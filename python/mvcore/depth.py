@@ -589,7 +589,8 @@ def disparity(
     seen = _confirmed(d, theirs[:, ::-1, 0]) & ~_speckles(d)
     cost = mine[..., 3]
     confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
-    guide = left if left.ndim == 3 else np.repeat(left[..., None], 3, 2)
+    picture = np.asarray(left)
+    guide = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, 2)
     found = _sharpened(_fill_occlusions(d, seen, images[0]), ~seen, guide, MEDIAN_RADIUS, MEDIAN_ROUNDS)
     return found if fill else np.where(seen, found, 0).astype(np.float32), confidence
 

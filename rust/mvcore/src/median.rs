@@ -102,7 +102,8 @@ fn median_at(
     }
     let own = &guide.data[3 * (y * w + x)..][..3];
     samples.clear();
-    let mut total = 0.0;
+    let (mut total, mut above, mut below) = (0.0, 0.0, 0.0);
+    let (least, most) = slack.map_or((mine, mine), |s| (mine - s, mine + s));
     for (at, weight) in near.offsets.iter().filter_map(place) {
         let value = values.data[at];
         if !value.is_nan() {
@@ -110,10 +111,13 @@ fn median_at(
             let differ = (0..3).map(|c| usize::from(own[c].abs_diff(theirs[c]))).sum::<usize>();
             let weight = weight * near.colour[differ];
             total += weight;
+            above += if value > most { weight } else { 0.0 };
+            below += if value < least { weight } else { 0.0 };
             samples.push((value, weight));
         }
     }
-    if samples.is_empty() {
+    // The median is beyond the slack where half of the weight is: elsewhere nobody asks what it is.
+    if samples.is_empty() || (slack.is_some() && 2.0 * above <= total && 2.0 * below < total) {
         return mine;
     }
     let found = select(samples, 0.5 * total);
