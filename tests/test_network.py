@@ -15,7 +15,7 @@ from mvcore.network.losses import loss
 from mvcore.network.model import DisparityNet
 from mvcore.network.regularise import soft_argmin, windowed_soft_argmin
 from mvcore.network.scenes import Tiles, random_pair, random_views
-from mvcore.network.train_disparity import Training, train_disparity
+from mvcore.network.train_disparity import Training, _rate, train_disparity
 from mvcore.network.weights import load_disparity, save_weights
 
 SMALL = Recipe(width=64, height=48)
@@ -112,6 +112,38 @@ def test_a_killed_training_goes_on_to_the_same_weights(tmp_path):
     assert all(torch.equal(states[0][k], states[1][k]) for k in states[0])
     with (broken / "log.csv").open() as file:
         assert [int(r["step"]) for r in csv.DictReader(file)] == [2, 4]
+
+
+def test_training_begins_from_given_weights(tmp_path):
+    torch.manual_seed(7)
+    net = DisparityNet()
+    save_weights(net, tmp_path / "start.safetensors")
+    training = Training(steps=1, every=1, rate=1e-9, workers=0, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
+    train_disparity(training, tmp_path / "run", report=lambda _: None)
+    after = torch.load(tmp_path / "run" / "last.pt", weights_only=True)["net"]
+    assert torch.allclose(after["gain"], net.gain, atol=1e-3)
+    first = "features.trunk.blocks.0.0.weight"
+    assert torch.allclose(after[first], net.state_dict()[first], atol=1e-3)
+
+
+def test_the_rate_falls_to_zero_by_the_steps_or_by_the_hours():
+    by_steps, by_hours = Training(steps=1000, warmup=10), Training(steps=1000, warmup=10, hours=1.0)
+    assert _rate(by_steps, 0, 0.0) == pytest.approx(by_steps.rate / 10)
+    assert _rate(by_steps, 200, 1e9) == by_steps.rate
+    assert _rate(by_steps, 999, 0.0) < 0.01 * by_steps.rate
+    assert _rate(by_hours, 200, 0.0) == by_hours.rate
+    assert _rate(by_hours, 200, 3590.0) < 0.01 * by_hours.rate
+    assert _rate(by_hours, 200, 9999.0) == 0
+
+
+@pytest.mark.parametrize("size", ["320", "320x250", "16x16", "ax b"])
+def test_sizes_that_training_cannot_take_are_named(size, tmp_path):
+    from mvcore.cli import app
+    from typer.testing import CliRunner
+
+    result = CliRunner().invoke(app, ["train", "disparity", "--out", str(tmp_path), "--size", size])
+    assert result.exit_code == 2
+    assert "--size" in result.stderr
 
 
 def test_weights_come_back_and_others_are_refused(tmp_path):

@@ -36,9 +36,10 @@ pub fn slice<'a, T: Element, D: Dimension>(
 
 /// A picture (h, w, 3) as a raster of its bytes, 3 w a row.
 pub fn picture<'a>(array: &'a PyReadonlyArray3<'_, u8>, argument: &'static str) -> PyResult<Raster<'a, u8>> {
-    let shape = array.as_array().dim();
-    Raster::new(slice(array, argument)?, shape.1 * shape.2, shape.0, argument)
-        .map_err(|error| to_python(array.py(), &error))
+    let [h, w, 3] = *array.shape() else {
+        return Err(PyValueError::new_err(format!("{argument}: expected shape (h, w, 3)")));
+    };
+    Raster::new(slice(array, argument)?, 3 * w, h, argument).map_err(|error| to_python(array.py(), &error))
 }
 
 /// A 2-D array as a raster.

@@ -1,9 +1,8 @@
 //! Bindings of the mesh and texture kernels.
 
-use crate::convert::{array, raster, run, slice};
+use crate::convert::{array, picture, raster, run, slice};
 use mvcore::atlas::Source;
 use mvcore::mesh::Mesh;
-use mvcore::raster::Raster;
 use mvcore::select_views::{Photo, Rating, SelectParams};
 use mvcore::shade::{Shots, Surface};
 use numpy::{
@@ -25,13 +24,6 @@ fn mesh<'a>(
 
 fn projection(p: &PyReadonlyArray2<'_, f64>) -> PyResult<[f64; 12]> {
     slice(p, "projection")?.try_into().map_err(|_| PyValueError::new_err("projection: expected shape (3, 4)"))
-}
-
-fn rgb<'a>(image: &'a PyReadonlyArray3<'_, u8>) -> PyResult<Raster<'a, u8>> {
-    let [h, w, 3] = *image.shape() else {
-        return Err(PyValueError::new_err("rgb: expected shape (h, w, 3)"));
-    };
-    Raster::new(slice(image, "rgb")?, 3 * w, h, "rgb").map_err(|e| PyValueError::new_err(e.to_string()))
 }
 
 #[pyfunction]
@@ -61,7 +53,7 @@ pub fn rate_faces<'py>(
     tolerance: f64,
 ) -> PyResult<(Bound<'py, PyArray1<f32>>, Bound<'py, PyArray2<u8>>)> {
     let ((v, f), projection) = (mesh(&vertices, &faces)?, projection(&matrix)?);
-    let (rgb, detail, depth) = (rgb(&image)?, raster(&detail, "detail")?, raster(&depth, "depth")?);
+    let (rgb, detail, depth) = (picture(&image, "rgb")?, raster(&detail, "detail")?, raster(&depth, "depth")?);
     let photo = Photo { rgb, detail, depth, projection, center };
     let ratings = run(py, || mvcore::select_views::rate(Mesh::new(v, f)?, &photo, tolerance))?;
     let n = ratings.len();
@@ -110,7 +102,7 @@ pub fn build_atlas<'py>(
         return Err(PyValueError::new_err(format!("matrices, gains: expected {} of each", images.len())));
     }
     let source = |n: usize| -> PyResult<Source> {
-        Ok(Source { rgb: rgb(&images[n])?, projection: projection(&matrices[n])?, gain: gains[n] })
+        Ok(Source { rgb: picture(&images[n], "rgb")?, projection: projection(&matrices[n])?, gain: gains[n] })
     };
     let sources = (0..images.len()).map(source).collect::<PyResult<Vec<_>>>()?;
     let t = run(py, || mvcore::atlas::build_atlas(Mesh::new(v, f)?, labels, &sources, max_size))?;

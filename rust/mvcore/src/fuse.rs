@@ -7,9 +7,9 @@
 //! Voxels farther than τ in front of a surface get +τ from that view: free space carves what other views put there by mistake.
 //! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid; or they only
 //! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Deep inside a hull
-//! that cuts, nothing is observed and no surface passes: blocks there may be left out, so that the cost grows with the surface, not
-//! with the room in it. Curless and Levoy, SIGGRAPH 1996; blocks after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in
-//! order: the same bytes for any thread count.
+//! that cuts, nothing is observed and no surface passes: blocks there may be left out. Curless and Levoy, SIGGRAPH 1996; blocks
+//! after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in order: the same bytes for any
+//! thread count.
 
 use crate::error::{Error, Result, require};
 use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
@@ -103,7 +103,8 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
         )?;
     }
     let count = tile.count();
-    let table = count.saturating_mul(5);
+    // A slot and three flags a block.
+    let table = count.saturating_mul(7);
     if table > params.max_memory {
         return Err(Error::OutOfMemory { what: "block table", needed: table, allowed: params.max_memory });
     }
