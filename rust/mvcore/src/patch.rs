@@ -118,15 +118,15 @@ const ACROSS: (i32, i32) = (0x00ff_00ff, 0x0080_0080);
 /// The grey level that counts as 0 in all sums.
 pub const GREY_ZERO: f32 = 128.0;
 
-/// The readable twin.
+/// The readable twin. It finds the samples with the same fused steps, or a place halfway between two steps would round the other way.
 pub fn sums_portable(source: &Quads, window: &Window, at: Affine) -> [f32; 3] {
     let (dx, dy, n) = (&OFFSETS.0, &OFFSETS.1, OFFSETS.2);
-    let [ux, vx, uy, vy] = at.jacobian;
-    let (x_max, y_max) = ((source.width - 1) as f32, (source.height - 1) as f32);
+    let [ux, vx, uy, vy] = at.jacobian.map(|j| UNIT * j);
+    let (x_max, y_max) = (UNIT * (source.width - 1) as f32, UNIT * (source.height - 1) as f32);
     let mut sums = [0.0; 3];
     for i in 0..n {
-        let u = UNIT * (at.u + dx[i] * ux + dy[i] * uy).clamp(0.0, x_max);
-        let v = UNIT * (at.v + dx[i] * vx + dy[i] * vy).clamp(0.0, y_max);
+        let u = dx[i].mul_add(ux, dy[i].mul_add(uy, UNIT * at.u)).clamp(0.0, x_max);
+        let v = dx[i].mul_add(vx, dy[i].mul_add(vy, UNIT * at.v)).clamp(0.0, y_max);
         let (u, v) = (u.round_ties_even() as usize, v.round_ties_even() as usize);
         let (x, y) = (u >> BITS, v >> BITS);
         let (fx, fy) = ((u as f32 / UNIT).fract(), (v as f32 / UNIT).fract());
@@ -287,10 +287,14 @@ mod tests {
                 // SAFETY: checked just above.
                 kinds.push(|q, w, a| unsafe { sums_avx2(q, w, a) });
             }
+            // Rounding goes with the terms, not with a sum in which they cancel: the weights add up to 1, so that (Cauchy-Schwarz)
+            // no sum of samples exceeds √Σws², nor that with the reference 255 times it.
+            let root = slow[1].max(1.0).sqrt();
+            let bound = [root, slow[1].max(1.0), 255.0 * root];
             for kind in kinds {
                 let fast = kind(&quads, &window, at);
                 for k in 0..3 {
-                    prop_assert!((fast[k] - slow[k]).abs() <= 1e-4 * slow[k].abs().max(1.0), "{fast:?} {slow:?}");
+                    prop_assert!((fast[k] - slow[k]).abs() <= 1e-5 * bound[k], "{fast:?} {slow:?}");
                 }
             }
         }
