@@ -14,8 +14,9 @@ from mvcore.io.maps import write_pfm
 from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.cost import correlate, cost_space, scaled_maps, unit
 from mvcore.network.datasets import LAYOUTS, cropped, find_items
+from mvcore.network.folding import folded, unfolded
 from mvcore.network.logs import plot_log
-from mvcore.network.match import MOST_SEEN, Matcher, folded, padded
+from mvcore.network.match import MOST_SEEN, Matcher, padded
 from mvcore.network.model import DisparityNet
 from mvcore.network.recognition import SHIPPED, TargetClassifier, load_classifier, rank_1, squared_error
 from mvcore.network.targets import SIZE, Target
@@ -43,7 +44,7 @@ def test_the_rust_cost_space_equals_the_torch_form(channels, groups, factor):
         assert (ours - theirs).abs().max() < 1e-3
 
 
-def test_folding_normalisations_changes_nothing():
+def test_folding_normalisations_and_unfolding_change_nothing():
     torch.manual_seed(0)
     net = DisparityNet().eval()
     for module in net.modules():
@@ -55,10 +56,12 @@ def test_folding_normalisations_changes_nothing():
     with torch.no_grad():
         before = net(*arguments)
         after = folded(net)(*arguments)
+        again = unfolded(net)(*arguments)
     left = [name for name, m in net.named_modules() if isinstance(m, torch.nn.BatchNorm3d)]
     assert all("join1" in name for name in left)  # those follow a sum
     span = (batch.high - batch.low)[:, None, None]
-    assert ((before.inverse - after.inverse).abs() / span).max() < 1e-3
+    for other in (after, again):
+        assert ((before.inverse - other.inverse).abs() / span).max() < 1e-3
 
 
 def test_padding_keeps_pixels_where_they_are():

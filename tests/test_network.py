@@ -12,6 +12,7 @@ from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.cost import correlate, landing, scaled_maps, unit
 from mvcore.network.features import PRESETS, Trunk, load_vgg16
 from mvcore.network.losses import loss
+from mvcore.network.match import SHIPPED
 from mvcore.network.model import DisparityNet
 from mvcore.network.regularise import soft_argmin, windowed_soft_argmin
 from mvcore.network.scenes import Tiles, random_pair, random_views
@@ -124,6 +125,43 @@ def test_training_begins_from_given_weights(tmp_path):
     assert torch.allclose(after["gain"], net.gain, atol=1e-3)
     first = "features.trunk.blocks.0.0.weight"
     assert torch.allclose(after[first], net.state_dict()[first], atol=1e-3)
+
+
+def test_held_statistics_stay_and_the_weights_are_those_of_the_usual_build(tmp_path):
+    torch.manual_seed(7)
+    net, batch = DisparityNet(), make_batch(SMALL, 0)
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm3d):
+            module.running_mean.normal_(0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+    save_weights(net, tmp_path / "start.safetensors")
+    training = Training(2, every=2, rate=1e-9, workers=0, held=True, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
+    best = train_disparity(training, tmp_path / "run", report=lambda _: None)
+    arguments = (batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+    with torch.no_grad():
+        before, after = (load_disparity(p)(*arguments).inverse for p in (tmp_path / "start.safetensors", best))
+    assert ((before - after).abs() / (batch.high - batch.low)[:, None, None]).median() < 1e-3
+
+
+def test_bfloat16_leaves_the_gradients_of_the_second_stage_as_they_are():
+    net, batch = load_disparity(SHIPPED).train(), make_batch(SMALL, 0)
+    gradients = []
+    for net.bfloat16 in (False, True):
+        net.zero_grad()
+        out = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, 32)
+        loss(out, batch.inverse, batch.low, batch.high).backward()
+        gradients.append(torch.cat([p.grad.flatten() for p in net.fine.parameters()]))
+    assert torch.isfinite(gradients[1]).all()
+    assert torch.nn.functional.cosine_similarity(*gradients, dim=0) > 0.95
+
+
+def test_held_statistics_need_weights_to_start_from(tmp_path):
+    from mvcore.cli import app
+    from typer.testing import CliRunner
+
+    result = CliRunner().invoke(app, ["train", "disparity", "--out", str(tmp_path), "--held"])
+    assert result.exit_code == 2
+    assert "start: expected weights" in result.stderr
 
 
 def test_the_rate_falls_to_zero_by_the_steps_or_by_the_hours():

@@ -360,6 +360,10 @@ def train_disparity_network(
     workers: Annotated[int, typer.Option(min=0, help="Processes that render.")] = 1,
     rate: Annotated[float, typer.Option(help="Learning rate.")] = 1e-3,
     start: Annotated[Path | None, typer.Option(help="Weights to begin from.")] = None,
+    held: Annotated[bool, typer.Option(help="Keep the batch statistics of --start, for batches too small to have their own.")] = False,
+    bfloat16: Annotated[bool | None, typer.Option(help="Most of the work in that precision; by default on CUDA.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Batches between checkpoints.")] = 250,
+    seed: Annotated[int, typer.Option(help="Of the scenes.")] = 1,
     debug: Debug = False,
 ) -> None:
     """Train the disparity network on procedural scenes, and on published sets where given."""
@@ -368,17 +372,30 @@ def train_disparity_network(
         from .network.datasets import find_items
         from .network.features import PRESETS
         from .network.logs import plot_log
-        from .network.train_disparity import Training, train_disparity
+        from .network.train_disparity import Training, keep_memory, train_disparity
 
         if preset not in PRESETS:
             raise ValueError(f"--preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
         for source in data or ():
             print(f"{source}: {len(find_items(source))} samples")
         width, height = _sides(size)
-        recipe = Recipe(data=tuple(data or ()), batch=batch, width=width, height=height)
+        recipe = Recipe(seed, batch, width, height, data=tuple(data or ()))
         pairs = str(middlebury) if middlebury else None
         begun = str(start) if start else None
-        training = Training(steps, preset, rate=rate, hours=hours, workers=workers, recipe=recipe, middlebury=pairs, start=begun)
+        training = Training(
+            steps,
+            preset,
+            rate=rate,
+            every=every,
+            hours=hours,
+            workers=workers,
+            bfloat16=bfloat16,
+            held=held,
+            recipe=recipe,
+            middlebury=pairs,
+            start=begun,
+        )
+        keep_memory()
         print(train_disparity(training, out, device))
         plot_log(out / "log.csv", out / "log.png")
 

@@ -6,18 +6,17 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
+from torch import Tensor
 
 from ..cameras import Camera, relative_map
 from ..errors import require
+from .folding import folded
 from .model import DisparityNet, Looks
 from .weights import load_disparity
 
@@ -108,17 +107,6 @@ class Matcher:
 
 MOST_SEEN = 24
 """Images whose features are kept: those of a rig's neighbourhood, some 5 MB each."""
-
-
-def folded(net: DisparityNet) -> DisparityNet:
-    """The same network for inference: each batch normalisation taken into the convolution before it."""
-    for module in net.modules():
-        parts = list(module._modules.items()) if isinstance(module, nn.Sequential) else []
-        for (name, conv), (after, norm) in pairwise(parts):
-            if isinstance(conv, nn.Conv3d) and isinstance(norm, nn.BatchNorm3d):
-                module._modules[name] = fuse_conv_bn_eval(conv, norm).to(memory_format=torch.channels_last_3d)
-                module._modules[after] = nn.Identity()
-    return net
 
 
 def planes_for(disparities: float) -> int:

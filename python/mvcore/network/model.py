@@ -54,12 +54,16 @@ class DisparityNet(nn.Module):
     preset : ``compact`` or ``paper``, the widths of the trunk.
     hourglasses : stacked; with one output module before them and one after each, three give the paper's four.
     groups : correlation groups at quarter size.
+
+    ``bfloat16`` puts the first stage's hourglasses, most of the work, into that precision. The rest stays in float32: planes a quarter
+    of the first stage's interval apart cost the same in bfloat16, and the gradients of the second stage were noise.
     """
 
     def __init__(self, preset: str = "compact", hourglasses: int = 3, groups: int = COARSE_GROUPS, windowed: bool = True) -> None:
         super().__init__()
         widths = PRESETS[preset]
         self.preset, self.groups, self.windowed = preset, groups, windowed
+        self.bfloat16 = False
         self.features = Features(widths)
         context = widths.blocks[2]
         self.coarse = Regulariser(groups, COARSE_CHANNELS, context, hourglasses)
@@ -94,7 +98,8 @@ class DisparityNet(nn.Module):
         swept = (low[:, None] + step[:, None] * number)[..., None, None].expand(b, planes, h, w)
         f = [unit(q, self.groups) for q in quarter]
         costs = cost_space(f[0], f[1:], [scaled_maps(m, 4) for m in maps], swept, self.groups, self.gain, self.bias)
-        coarse_scores = self.coarse(costs, context[0])
+        with torch.autocast(low.device.type, torch.bfloat16, enabled=self.bfloat16):
+            coarse_scores = self.coarse(costs, context[0])
         coarse, confidence = self._expected(coarse_scores[-1])
         begun = self.up4(torch.stack([coarse, confidence], 1), context[0])
         start = begun.detach()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
+import ctypes
 import os
+import platform
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,8 +19,10 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from ..errors import require
 from .batches import Batch, Recipe, make_batch
 from .datasets import Item, find_items
+from .folding import folded, unfolded
 from .logs import cut_log, log_row
 from .losses import loss
 from .match import RECTIFIED, padded, planes_for
@@ -32,6 +36,8 @@ class Training:
 
     steps : batches in all. rate : AdamW's, after ``warmup`` steps, falling linearly to zero over the last ``decay`` share.
     every : steps between validations and checkpoints. workers : processes that render.
+    bfloat16 : the first stage's hourglasses in that precision; by default on CUDA. held : the batch statistics of ``start`` are kept, for
+    batches too small to have their own.
     hours : the training ends after this long if not by its steps, and the rate falls to zero by then; such a run is not repeatable.
     """
 
@@ -47,6 +53,8 @@ class Training:
     averaging: float = 0.998
     hours: float | None = None
     workers: int = 1
+    bfloat16: bool | None = None
+    held: bool = False
     recipe: Recipe = field(default_factory=Recipe)
     middlebury: str | None = None
     """Folder of Middlebury scenes to validate on as well."""
@@ -87,11 +95,6 @@ def _stream(recipe: Recipe, first: int, steps: int, workers: int) -> Iterator[Ba
 THREADS = "RAYON_NUM_THREADS"
 
 
-def precision(device: torch.device) -> contextlib.AbstractContextManager[Any]:
-    """bfloat16 on CUDA. On a CPU float32: torch's bfloat16 convolutions there were seen to give other gradients each time, some NaN."""
-    return torch.autocast("cuda", torch.bfloat16) if device.type == "cuda" else contextlib.nullcontext()
-
-
 def _to(batch: Batch, device: torch.device) -> Batch:
     def moved(value: Any) -> Any:
         return value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
@@ -124,6 +127,21 @@ def _rate(training: Training, step: int, seconds: float) -> float:
     return training.rate * min(1.0, (step + 1) / training.warmup, (1 - done) / max(training.decay, 1e-6))
 
 
+def keep_memory() -> None:
+    """Lets this process keep freed memory: otherwise a CPU spends a quarter of a step on getting the same pages back from the system.
+
+    Does something on Linux with glibc only. It holds for the whole process, so it is for commands, not for a library's user.
+    """
+    if sys.platform == "linux" and platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        for parameter, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_TOP_PAD, 2**28)):
+            libc.mallopt(parameter, value)
+
+
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
+"""glibc's names for what mallopt sets."""
+
+
 def train_disparity(training: Training, out: Path, device: str = "cpu", report: Any = print, stop_after: int | None = None) -> Path:
     """Trains, or goes on where a run into the same folder stopped; returns the path of the best weights.
 
@@ -136,6 +154,11 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     net = DisparityNet(training.preset, training.hourglasses, training.groups, training.windowed).to(where).train()
     if training.start:
         load_into(net, notes_of(Path(training.start))[1], Path(training.start))
+    if training.held:
+        require(training.start is not None, "start", "weights whose statistics are held", None)
+        # What has no statistics of the batch to learn from need not keep them apart.
+        net = _held(folded(net))
+    net.bfloat16 = where.type == "cuda" if training.bfloat16 is None else training.bfloat16
     average = _Average(net, training.averaging)
     optimiser = torch.optim.AdamW(net.parameters(), training.rate, weight_decay=1e-4, fused=where.type == "cuda")
     pairs = find_items(f"middlebury:{training.middlebury}") if training.middlebury else []
@@ -152,7 +175,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
         spent = before + time.perf_counter() - started
         for group in optimiser.param_groups:
             group["lr"] = _rate(training, step, spent)
-        value = _step(net, optimiser, _to(batch, where), where)
+        value = _step(net, optimiser, _to(batch, where))
         if value is None:
             skipped += 1
         else:
@@ -169,7 +192,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
             total, seen, skipped = 0.0, 0, 0
             if figures["pair_bad1"] + figures["views_bad1"] < best:
                 best = figures["pair_bad1"] + figures["views_bad1"]
-                save_weights(average.net, out / "best.safetensors", {"step": str(step)})
+                save_weights(unfolded(average.net) if training.held else average.net, out / "best.safetensors", {"step": str(step)})
             state = {"net": net.state_dict(), "average": average.net.state_dict(), "optimiser": optimiser.state_dict()}
             torch.save({**state, "step": step, "best": best, "seconds": spent}, out / "last.tmp")
             os.replace(out / "last.tmp", last)
@@ -178,12 +201,20 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     return out / "best.safetensors"
 
 
-def _step(net: DisparityNet, optimiser: torch.optim.Optimizer, batch: Batch, device: torch.device) -> float | None:
+def _held(net: DisparityNet) -> DisparityNet:
+    """A network in training whose batch normalisations stay as they are."""
+    net.train()
+    for module in net.modules():
+        if isinstance(module, nn.BatchNorm3d):
+            module.eval()
+    return net
+
+
+def _step(net: DisparityNet, optimiser: torch.optim.Optimizer, batch: Batch) -> float | None:
     """One batch; the loss, or nothing where a gradient was not finite and the weights were left alone."""
     optimiser.zero_grad(set_to_none=True)
-    with precision(device):
-        output = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
-        value = loss(output, batch.inverse, batch.low, batch.high)
+    output = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+    value = loss(output, batch.inverse, batch.low, batch.high)
     value.backward()
     norm = nn.utils.clip_grad_norm_(net.parameters(), 2.0)
     if not torch.isfinite(norm):
@@ -225,8 +256,7 @@ def validate(net: DisparityNet, seed: int, device: torch.device, batches: int = 
         errors, pixels = [], []
         for batch in _held_out(seed, pairs, batches):
             batch = _to(batch, device)
-            with precision(device):
-                found: Prediction = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+            found: Prediction = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
             known = (batch.inverse > 0) & (batch.inverse >= batch.low[:, None, None]) & (batch.inverse <= batch.high[:, None, None])
             if name == "views":
                 known &= batch.seen.any(1)
