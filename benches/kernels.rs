@@ -156,6 +156,7 @@ const FUSION: FusionParams = FusionParams {
     min_weight: 0.05,
     solid_weight: 0.5,
     smoothing: 0.0,
+    measured_smoothing: 0.0,
     hull_tolerance: 0.05,
     complete: false,
     hollow: true,
@@ -223,6 +224,11 @@ fn volumes(c: &mut Criterion) {
     group.bench_function("fuse 24 maps 640x480 into 256^3", |b| b.iter(|| fuse(grid, &views, &FUSION).unwrap()));
     let smooth = FusionParams { smoothing: 0.7, ..FUSION };
     group.bench_function("the same, smoothed", |b| b.iter(|| fuse(grid, &views, &smooth).unwrap()));
+    let masked: Vec<_> = views.iter().map(|v| FusionView { silhouette: Some(raster(&soft)), ..*v }).collect();
+    let wide = FusionParams { smoothing: 2.0, measured_smoothing: 0.7, ..FUSION };
+    group.bench_function("the same cut by silhouettes, smoothed where it was not measured", |b| {
+        b.iter(|| fuse(grid, &masked, &wide).unwrap());
+    });
     let volume = fuse(grid, &views, &FUSION).unwrap();
     group.throughput(Throughput::Elements(volume.values.len() as u64));
     group.bench_function("isosurface of that, sparse", |b| {

@@ -98,6 +98,7 @@ def fuse(
     min_weight: float,
     solid_weight: float,
     smoothing: float,
+    measured_smoothing: float,
     hull_tolerance: float,
     complete: bool = ...,
     hollow: bool = ...,

@@ -114,13 +114,13 @@ class VolumeConfig:
     """Weight of seeing through a voxel against seeing a surface there."""
     min_weight: float = 0.05
     """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
-    solid_share: float = 0.18
+    solid_share: float = 0.1
     """With silhouettes: weight of observations, a view, that overrules the solid inside of the hull, times the share of the silhouettes'
     pixels that was not measured: where depth maps show little, what they show is doubtful."""
     smoothing: float = 0.7
-    """Voxels: standard deviation of the field's smoothing without masks."""
+    """Voxels: standard deviation of the field's smoothing without masks, and with them where depth maps measured it well."""
     solid_smoothing: float = 2.0
-    """With masks: where depth is known here and not there, the solid inside of the hull would leave crumbs."""
+    """With masks, elsewhere: where depth is known here and not there, the solid inside of the hull would leave crumbs."""
     hull_tolerance: float = 0.04
     """Share of the silhouettes that may disagree: one wrong mask among 25 does no harm; with fewer views each is needed."""
     max_memory: int = 4 << 30

@@ -192,6 +192,7 @@ class _Fusion:
             min_weight=config.min_weight,
             solid_weight=config.solid_share * self.open_share * len(self.depths),
             smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
+            measured_smoothing=config.smoothing,
             hull_tolerance=config.hull_tolerance,
             complete=self.complete,
             hollow=hollow,

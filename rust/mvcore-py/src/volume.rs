@@ -38,7 +38,7 @@ pub fn consistency<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, measured_smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -55,6 +55,7 @@ pub fn fuse<'py>(
     min_weight: f32,
     solid_weight: f32,
     smoothing: f32,
+    measured_smoothing: f32,
     hull_tolerance: f32,
     complete: bool,
     hollow: bool,
@@ -84,6 +85,7 @@ pub fn fuse<'py>(
         min_weight,
         solid_weight,
         smoothing,
+        measured_smoothing,
         hull_tolerance,
         complete,
         hollow,

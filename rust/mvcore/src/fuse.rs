@@ -16,7 +16,7 @@ use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
 use crate::hull::{SoftSilhouette, cut_block, deep_inside, mark_hull, restrict_to_hull};
 use crate::memory::zeroed;
 use crate::raster::Raster;
-use crate::smooth::{Beyond, smooth};
+use crate::smooth::{Beyond, Bits, Measured, smooth};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -57,6 +57,8 @@ pub struct FusionParams {
     pub min_weight: f32,
     /// Standard deviation of the field's smoothing in voxels, 0 for none.
     pub smoothing: f32,
+    /// The same where silhouettes cut the field and what a Gaussian covers was measured nevertheless.
+    pub measured_smoothing: f32,
     /// With silhouettes: weight of observations that overrules the solid inside of the hull.
     pub solid_weight: f32,
     /// Share of the silhouettes that see a voxel and may disagree with its being inside.
@@ -78,8 +80,8 @@ pub struct Volume {
     pub values: Vec<f32>,
 }
 
-/// Bytes a voxel takes while it is fused.
-const VOXEL_BYTES: usize = 4;
+/// Bytes a voxel takes while it is fused: its distance, and the smoothed one.
+const VOXEL_BYTES: usize = 8;
 
 /// Fuses the views into the blocks near their surfaces (with silhouettes: also all blocks inside the hull).
 pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<Volume> {
@@ -131,19 +133,20 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
         flags = (0..count).into_par_iter().map(|n| flags[n] && !amid(&tile, n, &inside)).collect();
     }
     let map = BlockMap::from_flags(tile, flags.into_iter());
-    let needed = map.coords.len() * BLOCK * VOXEL_BYTES + table;
+    let needed = map.coords.len() * (BLOCK * VOXEL_BYTES + size_of::<Bits>()) + table;
     if needed > params.max_memory {
         return Err(Error::OutOfMemory { what: "volume", needed, allowed: params.max_memory });
     }
     let mut values = zeroed::<f32>(map.coords.len() * BLOCK);
-    values.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).for_each(|(out, at)| {
+    let mut bits = vec![Bits::default(); map.coords.len()];
+    values.par_chunks_exact_mut(BLOCK).zip(&mut bits).zip(map.coords.par_iter()).for_each(|((out, bits), at)| {
         let cut = |out: &mut [f32]| {
             cut_block(&grid, *at, &silhouettes, params.hull_tolerance, params.truncation, out);
         };
         match hull {
-            Hull::Unknown => integrate(&grid, *at, views, &tiles, params, &[f32::NAN; BLOCK], out),
+            Hull::Unknown => integrate(&grid, *at, views, &tiles, params, &[f32::NAN; BLOCK], out, bits),
             Hull::Cuts => {
-                integrate(&grid, *at, views, &tiles, params, &[-1.0; BLOCK], out);
+                integrate(&grid, *at, views, &tiles, params, &[-1.0; BLOCK], out, bits);
                 cut(out);
             }
             Hull::Completes => {
@@ -151,17 +154,22 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
                 cut(&mut distance);
                 // Farther outside than τ nothing is known of a voxel that no depth map reaches.
                 let open = distance.map(|d| if d < 1.0 { d } else { f32::NAN });
-                integrate(&grid, *at, views, &tiles, params, &open, out);
+                integrate(&grid, *at, views, &tiles, params, &open, out, bits);
             }
         }
     });
     if params.smoothing > 0.0 {
         // With silhouettes what no block covers is outside the hull.
         let beyond = if hull == Hull::Cuts { Beyond::Outside(&inside) } else { Beyond::Unknown };
-        values = smooth(&values, &map, params.smoothing, beyond);
+        let measured = (hull == Hull::Cuts && params.measured_smoothing > 0.0)
+            .then_some(Measured { bits: &bits, sigma: params.measured_smoothing });
+        values = smooth(&values, &map, params.smoothing, beyond, measured);
     }
     Ok(Volume { map, values })
 }
+
+/// Weight of observations, a confident depth has 1, that need no smoothing against their own noise.
+const MEASURED: f32 = 2.0;
 
 /// What the visual hull does to the field.
 #[derive(Clone, Copy, PartialEq)]
@@ -345,6 +353,7 @@ fn integrate(
     params: &FusionParams,
     otherwise: &[f32; BLOCK],
     out: &mut [f32],
+    bits: &mut Bits,
 ) {
     let inverse_truncation = (1.0 / params.truncation) as f32;
     let mut sum = [0.0f32; BLOCK];
@@ -369,6 +378,7 @@ fn integrate(
         let mean = sum[n] / total[n].max(1e-12);
         let known = total[n] > 0.0 && (near[n] >= least_near || (mean >= 0.0 && total[n] > least_free));
         out[n] = if known { mean } else { otherwise[n] };
+        bits[n / 64] |= u64::from(known && total[n] >= MEASURED) << (n % 64);
     }
 }
 
@@ -456,6 +466,7 @@ mod tests {
         min_weight: 0.0,
         solid_weight: 0.5,
         smoothing: 0.0,
+        measured_smoothing: 0.0,
         hull_tolerance: 0.0,
         complete: false,
         hollow: false,

@@ -4,6 +4,9 @@
 //!   (v·w, w) of a block and 4 voxels around it ──Gaussian along x, y, z──► Σ v·w / Σ w       (normalised convolution)
 //! ```
 //!
+//! With silhouettes a field is part measured, part the hull's guess. Where most of what a Gaussian covers was measured, a narrow one
+//! does: the wide one, which the seams between the two need, would round off what the photographs show.
+//!
 //! Unknown voxels count nothing and stay unknown. Knutsson and Westin, CVPR 1993. Each block is one task: the same bytes for any
 //! number of threads.
 
@@ -11,6 +14,7 @@ use crate::grid::{BLOCK, BlockMap, NONE, SIDE};
 use crate::memory::zeroed;
 use multiversion::multiversion;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Voxels beyond a block's sides that its smoothing reads; the kernel ends there.
 const HALO: usize = 4;
@@ -27,18 +31,51 @@ pub enum Beyond<'a> {
     Outside(&'a [bool]),
 }
 
+/// A block's voxels, a bit each.
+pub type Bits = [u64; BLOCK / 64];
+
+/// What was measured of a field whose rest is the hull's, and the standard deviation that does there.
+#[derive(Debug, Clone, Copy)]
+pub struct Measured<'a> {
+    /// One a block of the map.
+    pub bits: &'a [Bits],
+    /// Voxels.
+    pub sigma: f32,
+}
+
+/// Shares of measured voxels between which the narrow Gaussian takes the wide one's place.
+const MIXED: (f32, f32) = (0.6, 0.95);
+
+type Taps = [f32; 2 * HALO + 1];
+
+fn taps(sigma: f32) -> Taps {
+    std::array::from_fn(|k| (-0.5 * ((k as f32 - HALO as f32) / sigma).powi(2)).exp())
+}
+
 /// A Gaussian mean of the known voxels around each known one: normalised convolution, axis by axis.
-pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond) -> Vec<f32> {
-    let taps: [f32; 2 * HALO + 1] = std::array::from_fn(|k| (-0.5 * ((k as f32 - HALO as f32) / sigma).powi(2)).exp());
+pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measured: Option<Measured>) -> Vec<f32> {
+    let wide_taps = taps(sigma);
     // Open surfaces have free space on one side and nothing behind: far values must not outweigh the surface's own.
     let least = if matches!(beyond, Beyond::Outside(_)) { 1.0 } else { FAR_WEIGHT };
     let mut out = zeroed::<f32>(values.len());
     out.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).enumerate().for_each_init(
-        || vec![[0.0f32; 2]; WIDE * WIDE * WIDE],
-        |wide, (slot, (out, at))| {
+        || (vec![[0.0f32; 2]; WIDE * WIDE * WIDE], vec![[0.0f32; 2]; WIDE * WIDE * WIDE]),
+        |(wide, share), (slot, (out, at))| {
             wide.fill(if matches!(beyond, Beyond::Outside(_)) { [1.0, 1.0] } else { [0.0; 2] });
             gather(values, map, *at, least, beyond, wide);
-            smooth_block(wide, &taps, &values[slot * BLOCK..][..BLOCK], out);
+            let values = &values[slot * BLOCK..][..BLOCK];
+            smooth_block(wide, &wide_taps, values, out);
+            let Some(Measured { bits, sigma }) = measured else { return };
+            if gather_measured(bits, map, *at, share) == 0 {
+                return;
+            }
+            let (mut known, mut narrow) = ([0.0; BLOCK], [0.0; BLOCK]);
+            smooth_block(share, &wide_taps, values, &mut known);
+            smooth_block(wide, &taps(sigma), values, &mut narrow);
+            for n in 0..BLOCK {
+                let part = ((known[n] - MIXED.0) / (MIXED.1 - MIXED.0)).clamp(0.0, 1.0);
+                out[n] = part * narrow[n] + (1.0 - part) * out[n];
+            }
         },
     );
     out
@@ -46,15 +83,40 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond) -> Vec
 
 /// Puts a block with its surroundings into a wide one as (value, 1), and (0, 0) where nothing is known.
 fn gather(values: &[f32], map: &BlockMap, at: [u32; 3], least: f32, beyond: Beyond, wide: &mut [[f32; 2]]) {
+    rows_around(map, at, |index, slot, to, from| {
+        let from = match (slot, beyond) {
+            (NONE, Beyond::Outside(inside)) if inside[index] => &[-1.0; BLOCK][from],
+            (NONE, _) => return,
+            _ => &values[slot as usize * BLOCK..][from],
+        };
+        for (out, &v) in wide[to..].iter_mut().zip(from) {
+            let weight = if v.is_nan() { 0.0 } else { (1.0 - v * v).max(least) };
+            *out = [weight * v.max(-1.0), weight];
+        }
+    });
+}
+
+/// The same as (1 where measured, else 0; 1); how many are measured.
+fn gather_measured(bits: &[Bits], map: &BlockMap, at: [u32; 3], wide: &mut [[f32; 2]]) -> usize {
+    wide.fill([0.0, 1.0]);
+    let mut count = 0;
+    rows_around(map, at, |_, slot, to, from| {
+        let Some(bits) = bits.get(slot as usize) else { return };
+        for (out, n) in wide[to..].iter_mut().zip(from) {
+            let bit = bits[n / 64] >> (n % 64) & 1;
+            out[0] = bit as f32;
+            count += bit as usize;
+        }
+    });
+    count
+}
+
+/// Rows of the 27 blocks around one: index in the tile, slot, where the row starts in the wide block, which voxels of its own it is.
+fn rows_around(map: &BlockMap, at: [u32; 3], mut each: impl FnMut(usize, u32, usize, Range<usize>)) {
     for n in 0..27 {
         let step = [n / 9, n / 3 % 3, n % 3];
         let block = [0, 1, 2].map(|a| (at[a] as usize + step[a]).wrapping_sub(1));
         let Some(index) = map.tile.index(block) else { continue };
-        let from = match (map.slot[index], beyond) {
-            (NONE, Beyond::Outside(inside)) if inside[index] => &[-1.0; BLOCK],
-            (NONE, _) => continue,
-            (slot, _) => &values[slot as usize * BLOCK..][..BLOCK],
-        };
         // In the wide block this neighbour starts at HALO + (step - 1)·SIDE; only what lies inside is copied.
         let range = |a: usize| {
             let start = (HALO + step[a] * SIDE) as i32 - SIDE as i32;
@@ -64,11 +126,8 @@ fn gather(values: &[f32], map: &BlockMap, at: [u32; 3], least: f32, beyond: Beyo
         for i in ri {
             for j in rj.clone() {
                 let row = ((i as i32 + si) as usize * WIDE + (j as i32 + sj) as usize) * WIDE;
-                for k in rk.clone() {
-                    let v = from[(i * SIDE + j) * SIDE + k];
-                    let weight = if v.is_nan() { 0.0 } else { (1.0 - v * v).max(least) };
-                    wide[row + (k as i32 + sk) as usize] = [weight * v.max(-1.0), weight];
-                }
+                let own = (i * SIDE + j) * SIDE;
+                each(index, map.slot[index], row + (rk.start as i32 + sk) as usize, own + rk.start..own + rk.end);
             }
         }
     }
@@ -126,11 +185,32 @@ mod tests {
         let speck = 7 * BLOCK + 3 * 64 + 3 * 8 + 3;
         let unknown = BLOCK + 5;
         (values[speck], values[unknown]) = (-0.9, f32::NAN);
-        let found = smooth(&values, &map, 1.0, Beyond::Unknown);
+        let found = smooth(&values, &map, 1.0, Beyond::Unknown, None);
         assert!(found[unknown].is_nan());
         assert!((found[speck] - 3.5 / 16.0).abs() < 0.15, "{}", found[speck]);
         // Away from the speck and the ends of the ramp the slope is kept.
         let away = 4 * 64; // slot 0, i = 4
         assert!((found[away] - values[away]).abs() < 1e-2);
+    }
+
+    #[test]
+    fn what_was_measured_is_smoothed_by_the_narrow_gaussian() {
+        let map = BlockMap::from_flags(Tile { low: [0; 3], high: [3; 3] }, std::iter::repeat_n(true, 27));
+        let values: Vec<f32> =
+            (0..27 * BLOCK as u32).map(|n| (n.wrapping_mul(2654435761) >> 24) as f32 / 255.0 - 0.5).collect();
+        let outside = vec![false; 27];
+        let run = |sigma, measured| smooth(&values, &map, sigma, Beyond::Outside(&outside), measured);
+        let (all, none) = (vec![[u64::MAX; BLOCK / 64]; 27], vec![Bits::default(); 27]);
+        let mixed = |bits| run(2.0, Some(Measured { bits, sigma: 0.7 }));
+        let (wide, narrow) = (run(2.0, None), run(0.7, None));
+        let middle = 13 * BLOCK..14 * BLOCK;
+        assert_eq!(mixed(&none), wide);
+        assert_eq!(mixed(&all)[middle.clone()], narrow[middle]);
+        // Half measured: by the narrow one far on that side of the border, by the wide one on the other.
+        let half: Vec<Bits> = map.coords.iter().map(|at| if at[0] == 0 { all[0] } else { none[0] }).collect();
+        let found = mixed(&half);
+        let at = |i: usize| (9 * (i / SIDE) + 4) * BLOCK + (i % SIDE * SIDE + 4) * SIDE + 4;
+        assert_eq!(found[at(4)], narrow[at(4)]);
+        assert_eq!(found[at(9)], wide[at(9)]);
     }
 }
