@@ -320,7 +320,7 @@ def test_tiles_join_to_the_surface_of_the_whole(ring, cut):
     bounds = np.array([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
     config, report = VolumeConfig(voxel=0.02), Report()
     whole = fuse(maps, cameras, bounds, given, config)
-    tiles = list(fuse_tiles(maps, cameras, bounds, given, replace(config, max_memory=whole.values.nbytes // 3), report))
+    tiles = list(fuse_tiles(maps, cameras, bounds, given, replace(config, max_memory=2 * whole.values.nbytes // 3), report))
     assert len(tiles) > 2
     assert report.values["volume"]["tiles"] == len(tiles)
     assert report.values["volume"]["voxel"] == whole.voxel
