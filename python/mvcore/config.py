@@ -63,7 +63,7 @@ class DepthConfig:
     """Rounds of slanted refinement at the sweep's scale, where they are cheap."""
     rounds: int = 1
     """Rounds at each finer scale."""
-    network_weight: float = 12.0
+    network_weight: float = 16.0
     """With the network: cost units, at full confidence, of a plane far from what it found."""
     network_reach: float = 6.0
     """Planes at which that cost stops growing."""
@@ -114,7 +114,7 @@ class VolumeConfig:
     """Weight of seeing through a voxel against seeing a surface there."""
     min_weight: float = 0.05
     """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
-    solid_share: float = 0.1
+    solid_share: float = 0.18
     """With silhouettes: weight of observations, a view, that overrules the solid inside of the hull, times the share of the silhouettes'
     pixels that was not measured: where depth maps show little, what they show is doubtful."""
     smoothing: float = 0.7
