@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mvcore.cameras import relative_map
-from mvcore.errors import FormatError
+from mvcore.errors import FormatError, InvalidInputError
 from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.cost import correlate, landing, scaled_maps, unit
 from mvcore.network.features import PRESETS, Trunk, load_vgg16
@@ -137,6 +137,8 @@ def test_held_statistics_stay_and_the_weights_are_those_of_the_usual_build(tmp_p
     save_weights(net, tmp_path / "start.safetensors")
     training = Training(2, every=2, rate=1e-9, workers=0, held=True, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
     best = train_disparity(training, tmp_path / "run", report=lambda _: None)
+    with pytest.raises(InvalidInputError, match="held: expected True, as the run in"):
+        train_disparity(replace(training, held=False), tmp_path / "run", report=lambda _: None)
     arguments = (batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
     with torch.no_grad():
         before, after = (load_disparity(p)(*arguments).inverse for p in (tmp_path / "start.safetensors", best))

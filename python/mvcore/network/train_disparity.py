@@ -165,6 +165,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     step, best, before, last = 0, float("inf"), 0.0, out / "last.pt"
     if last.exists():
         state = torch.load(last, map_location=where, weights_only=True)
+        require(state.get("held", False) == training.held, "held", f"{not training.held}, as the run in {out} began", training.held)
         net.load_state_dict(state["net"])
         average.net.load_state_dict(state["average"])
         optimiser.load_state_dict(state["optimiser"])
@@ -194,7 +195,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
                 best = figures["pair_bad1"] + figures["views_bad1"]
                 save_weights(unfolded(average.net) if training.held else average.net, out / "best.safetensors", {"step": str(step)})
             state = {"net": net.state_dict(), "average": average.net.state_dict(), "optimiser": optimiser.state_dict()}
-            torch.save({**state, "step": step, "best": best, "seconds": spent}, out / "last.tmp")
+            torch.save({**state, "held": training.held, "step": step, "best": best, "seconds": spent}, out / "last.tmp")
             os.replace(out / "last.tmp", last)
         if timed_out or step == stop_after:
             break
