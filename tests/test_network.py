@@ -127,7 +127,7 @@ def test_training_begins_from_given_weights(tmp_path):
     assert torch.allclose(after[first], net.state_dict()[first], atol=1e-3)
 
 
-def test_held_statistics_stay_and_the_weights_are_those_of_the_usual_build(tmp_path):
+def test_frozen_statistics_stay_and_the_weights_are_those_of_the_usual_build(tmp_path):
     torch.manual_seed(7)
     net, batch = DisparityNet(), make_batch(SMALL, 0)
     for module in net.modules():
@@ -135,10 +135,10 @@ def test_held_statistics_stay_and_the_weights_are_those_of_the_usual_build(tmp_p
             module.running_mean.normal_(0, 0.1)
             module.running_var.uniform_(0.5, 1.5)
     save_weights(net, tmp_path / "start.safetensors")
-    training = Training(2, every=2, rate=1e-9, workers=0, held=True, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
+    training = Training(2, every=2, rate=1e-9, workers=0, freeze_norms=True, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
     best = train_disparity(training, tmp_path / "run", report=lambda _: None)
-    with pytest.raises(InvalidInputError, match="held: expected True, as the run in"):
-        train_disparity(replace(training, held=False), tmp_path / "run", report=lambda _: None)
+    with pytest.raises(InvalidInputError, match="freeze_norms: expected True, as the run in"):
+        train_disparity(replace(training, freeze_norms=False), tmp_path / "run", report=lambda _: None)
     arguments = (batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
     with torch.no_grad():
         before, after = (load_disparity(p)(*arguments).inverse for p in (tmp_path / "start.safetensors", best))
@@ -157,11 +157,11 @@ def test_bfloat16_leaves_the_gradients_of_the_second_stage_as_they_are():
     assert torch.nn.functional.cosine_similarity(*gradients, dim=0) > 0.95
 
 
-def test_held_statistics_need_weights_to_start_from(tmp_path):
+def test_frozen_statistics_need_weights_to_start_from(tmp_path):
     from mvcore.cli import app
     from typer.testing import CliRunner
 
-    result = CliRunner().invoke(app, ["train", "disparity", "--out", str(tmp_path), "--held"])
+    result = CliRunner().invoke(app, ["train", "disparity", "--out", str(tmp_path), "--freeze-norms"])
     assert result.exit_code == 2
     assert "start: expected weights" in result.stderr
 

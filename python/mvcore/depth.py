@@ -589,9 +589,7 @@ def disparity(
     seen = _confirmed(d, theirs[:, ::-1, 0]) & ~_speckles(d)
     cost = mine[..., 3]
     confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
-    picture = np.asarray(left)
-    guide = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, 2)
-    found = _sharpened(_fill_occlusions(d, seen, images[0]), ~seen, guide, MEDIAN_RADIUS, MEDIAN_ROUNDS)
+    found = _sharpened(_fill_occlusions(d, seen, images[0]), ~seen, _three_channels(left), MEDIAN_RADIUS, MEDIAN_ROUNDS)
     return found if fill else np.where(seen, found, 0).astype(np.float32), confidence
 
 
@@ -627,10 +625,10 @@ def _expected(pair: Sequence[NDArray[np.uint8]], low: int, high: int, device: st
     """What the network finds in a pair."""
     from .network.match import shipped_matcher
 
-    h, w = pair[0].shape[:2]
+    views = [_three_channels(i) for i in pair]
+    h, w = views[0].shape[:2]
     share = min(1.0, PAIR_SIDE / max(h, w))
     size = (max(2, round(w * share)), max(2, round(h * share)))
-    views = [np.repeat(i[..., None], 3, 2) if i.ndim == 2 else i for i in pair]
     if share < 1:
         views = [cv2.resize(v, size, interpolation=cv2.INTER_AREA) for v in views]
     ratio = size[0] / w
@@ -638,6 +636,11 @@ def _expected(pair: Sequence[NDArray[np.uint8]], low: int, high: int, device: st
     found, confidence = shipped_matcher(device).disparity(views[0], views[1], *ends)
     inverse = _resized(found, (h, w)) / np.float32(ratio)
     return _Expected(inverse, cv2.resize(confidence, (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def _three_channels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    image = np.asarray(image)
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
 
 
 def _grey(name: str, image: NDArray[np.uint8]) -> Grey:

@@ -36,8 +36,8 @@ class Training:
 
     steps : batches in all. rate : AdamW's, after ``warmup`` steps, falling linearly to zero over the last ``decay`` share.
     every : steps between validations and checkpoints. workers : processes that render.
-    bfloat16 : the first stage's hourglasses in that precision; by default on CUDA. held : the batch statistics of ``start`` are kept, for
-    batches too small to have their own.
+    bfloat16 : the first stage's hourglasses in that precision; by default on CUDA.
+    freeze_norms : batch normalisation keeps the statistics of ``start``, for batches too small to have their own.
     hours : the training ends after this long if not by its steps, and the rate falls to zero by then; such a run is not repeatable.
     """
 
@@ -54,7 +54,7 @@ class Training:
     hours: float | None = None
     workers: int = 1
     bfloat16: bool | None = None
-    held: bool = False
+    freeze_norms: bool = False
     recipe: Recipe = field(default_factory=Recipe)
     middlebury: str | None = None
     """Folder of Middlebury scenes to validate on as well."""
@@ -128,7 +128,7 @@ def _rate(training: Training, step: int, seconds: float) -> float:
 
 
 def keep_memory() -> None:
-    """Lets this process keep freed memory: otherwise a CPU spends a quarter of a step on getting the same pages back from the system.
+    """Lets this process keep freed memory: otherwise a CPU spends a fifth of a step on getting the same pages back from the system.
 
     Does something on Linux with glibc only. It holds for the whole process, so it is for commands, not for a library's user.
     """
@@ -154,10 +154,10 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     net = DisparityNet(training.preset, training.hourglasses, training.groups, training.windowed).to(where).train()
     if training.start:
         load_into(net, notes_of(Path(training.start))[1], Path(training.start))
-    if training.held:
-        require(training.start is not None, "start", "weights whose statistics are held", None)
+    if training.freeze_norms:
+        require(training.start is not None, "start", "weights whose statistics are kept", None)
         # What has no statistics of the batch to learn from need not keep them apart.
-        net = _held(folded(net))
+        net = _frozen(folded(net))
     net.bfloat16 = where.type == "cuda" if training.bfloat16 is None else training.bfloat16
     average = _Average(net, training.averaging)
     optimiser = torch.optim.AdamW(net.parameters(), training.rate, weight_decay=1e-4, fused=where.type == "cuda")
@@ -165,7 +165,8 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
     step, best, before, last = 0, float("inf"), 0.0, out / "last.pt"
     if last.exists():
         state = torch.load(last, map_location=where, weights_only=True)
-        require(state.get("held", False) == training.held, "held", f"{not training.held}, as the run in {out} began", training.held)
+        begun = state.get("freeze_norms", False)
+        require(begun == training.freeze_norms, "freeze_norms", f"{begun}, as the run in {out} began", training.freeze_norms)
         net.load_state_dict(state["net"])
         average.net.load_state_dict(state["average"])
         optimiser.load_state_dict(state["optimiser"])
@@ -193,16 +194,18 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
             total, seen, skipped = 0.0, 0, 0
             if figures["pair_bad1"] + figures["views_bad1"] < best:
                 best = figures["pair_bad1"] + figures["views_bad1"]
-                save_weights(unfolded(average.net) if training.held else average.net, out / "best.safetensors", {"step": str(step)})
+                found = unfolded(average.net) if training.freeze_norms else average.net
+                save_weights(found, out / "best.safetensors", {"step": str(step)})
             state = {"net": net.state_dict(), "average": average.net.state_dict(), "optimiser": optimiser.state_dict()}
-            torch.save({**state, "held": training.held, "step": step, "best": best, "seconds": spent}, out / "last.tmp")
+            state |= {"freeze_norms": training.freeze_norms, "step": step, "best": best, "seconds": spent}
+            torch.save(state, out / "last.tmp")
             os.replace(out / "last.tmp", last)
         if timed_out or step == stop_after:
             break
     return out / "best.safetensors"
 
 
-def _held(net: DisparityNet) -> DisparityNet:
+def _frozen(net: DisparityNet) -> DisparityNet:
     """A network in training whose batch normalisations stay as they are."""
     net.train()
     for module in net.modules():

@@ -64,17 +64,25 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measur
             wide.fill(if matches!(beyond, Beyond::Outside(_)) { [1.0, 1.0] } else { [0.0; 2] });
             gather(values, map, *at, least, beyond, wide);
             let values = &values[slot * BLOCK..][..BLOCK];
-            smooth_block(wide, &wide_taps, values, out);
-            let Some(Measured { bits, sigma }) = measured else { return };
-            if gather_measured(bits, map, *at, share) == 0 {
-                return;
+            // How much of each voxel's surroundings was measured decides which of the two Gaussians a block needs.
+            let mut part = [0.0; BLOCK];
+            if let Some(Measured { bits, .. }) = measured
+                && gather_measured(bits, map, *at, share) > 0
+            {
+                smooth_block(share, &wide_taps, values, &mut part);
+                part = part.map(|p| ((p - MIXED.0) / (MIXED.1 - MIXED.0)).clamp(0.0, 1.0));
             }
-            let (mut known, mut narrow) = ([0.0; BLOCK], [0.0; BLOCK]);
-            smooth_block(share, &wide_taps, values, &mut known);
-            smooth_block(wide, &taps(sigma), values, &mut narrow);
-            for n in 0..BLOCK {
-                let part = ((known[n] - MIXED.0) / (MIXED.1 - MIXED.0)).clamp(0.0, 1.0);
-                out[n] = part * narrow[n] + (1.0 - part) * out[n];
+            if part.iter().any(|&p| p < 1.0) {
+                smooth_block(wide, &wide_taps, values, out);
+            }
+            if let Some(Measured { sigma, .. }) = measured
+                && part.iter().any(|&p| p > 0.0)
+            {
+                let mut narrow = [0.0; BLOCK];
+                smooth_block(wide, &taps(sigma), values, &mut narrow);
+                for n in 0..BLOCK {
+                    out[n] = part[n] * narrow[n] + (1.0 - part[n]) * out[n];
+                }
             }
         },
     );
