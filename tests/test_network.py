@@ -151,6 +151,8 @@ def test_bfloat16_leaves_the_gradients_of_the_second_stage_as_they_are():
     for net.bfloat16 in (False, True):
         net.zero_grad()
         out = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, 32)
+        assert out.coarse_scores[0].dtype == (torch.bfloat16 if net.bfloat16 else torch.float32)
+        assert out.fine_scores[0].dtype == torch.float32
         loss(out, batch.inverse, batch.low, batch.high).backward()
         gradients.append(torch.cat([p.grad.flatten() for p in net.fine.parameters()]))
     assert torch.isfinite(gradients[1]).all()
