@@ -56,7 +56,8 @@ class DisparityNet(nn.Module):
     groups : correlation groups at quarter size.
 
     ``bfloat16`` puts the first stage's hourglasses, most of the work, into that precision. The rest stays in float32: planes a quarter
-    of the first stage's interval apart cost nearly the same in bfloat16, and in some batches the second stage's gradients had little to do with float32's.
+    of the first stage's interval apart cost nearly the same in bfloat16, and in some batches the second stage's gradients had little
+    to do with float32's.
     """
 
     def __init__(self, preset: str = "compact", hourglasses: int = 3, groups: int = COARSE_GROUPS, windowed: bool = True) -> None:
