@@ -212,9 +212,9 @@ def disparity(
     with _one_line_errors(debug):
         from . import _core
         from .depth import disparity as match
+        from .files import atomically
         from .io.images import read_image
         from .io.maps import colourise, write_pfm
-        from .io.write import atomically
 
         if output.suffix not in (".pfm", ".png"):
             raise ValueError(f"--output: expected a name ending in .pfm or .png, got {str(output)!r}")
@@ -331,7 +331,7 @@ def train_data(
     """A contact sheet of procedural scenes: views, true inverse depth, what the first source sees."""
     with _one_line_errors(debug):
         from ._core import encode_png
-        from .io.write import atomically
+        from .files import atomically
         from .network.scenes import contact_sheet
 
         sheet, speed = contact_sheet(seed, held_out)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +16,8 @@ from PIL import Image as PillowImage
 from . import _core
 from .cameras import Calibration
 from .errors import InvalidInputError, require
+from .files import atomically, staged
 from .io.maps import colourise, write_depth_png, write_pfm
-from .io.write import atomically
 from .types import Bounds, DepthMap, Image, SparsePoints
 
 if TYPE_CHECKING:
@@ -121,15 +119,11 @@ class Reconstruction:
             f"{stem}.mtl": f"newmtl photo\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {stem}.png\n".encode(),
             f"{stem}.obj": text.getvalue().encode(),
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{stem}-", dir=path.parent))
-        try:
+        with staged(path) as folder:
             for name, data in parts.items():
                 (folder / name).write_bytes(data)
             for name in parts:  # the OBJ last: once it is there, all it names is there
                 os.replace(folder / name, path.parent / name)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
 
     def save_depth(self, folder: str | Path, format: str = "pfm") -> None:
         """Write each view's filtered depth as ``pfm``, ``png`` (16 bit, scale beside it) or ``npz``, and a coloured picture."""

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import FormatError
+from .files import atomically
 from .io.maps import colourise
-from .io.write import atomically
 from .result import Reconstruction
 
 INDEX = "index.json"

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
-import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +13,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .files import atomically
 
 META = "meta"
 """Name of the array that holds an entry's JSON."""
@@ -102,15 +102,6 @@ class Store:
         return Entry(arrays, meta)
 
     def save(self, key: str, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> None:
-        """Write an entry under a temporary name, then rename it."""
-        path = self.path(key)
-        path.parent.mkdir(exist_ok=True)
+        """Write an entry beside its place, then rename it."""
         text = np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8)
-        handle, temporary = tempfile.mkstemp(prefix=".writing-", suffix=".npz", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, **{**arrays, META: text})
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        atomically(self.path(key), lambda p: np.savez(p, **{**arrays, META: text}))

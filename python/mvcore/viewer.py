@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .errors import ReconstructionError
-from .io.write import atomically
+from .files import atomically
 from .sequence import read_index
 from .surface import Surface, decimate
 

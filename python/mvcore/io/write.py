@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,30 +12,11 @@ import numpy as np
 
 from ..cameras import Calibration, Camera
 from ..errors import InvalidInputError, require
+from ..files import atomically, staged
 from ..types import Bounds, Scene
 from .colmap import rotation_to_quaternion
 
 FORMATS = ("mvcore", "colmap", "mvsnet")
-
-
-def atomically(path: Path, write: Callable[[Path], None]) -> None:
-    """Have ``write`` make a file under a temporary name in the same folder, then rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    try:
-        write(Path(temporary))
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def save_calibration(path: str | Path, scene: Scene, format: str = "mvcore") -> None:
@@ -99,16 +78,12 @@ def _colmap_camera(camera: Camera) -> str:
 
 def _in_folder(path: Path, fill: Callable[[Path], None]) -> None:
     """Fill a temporary folder, then move its files into place."""
-    path.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=".mvcore-", dir=path))
-    try:
-        fill(temporary)
-        for file in sorted(p for p in temporary.rglob("*") if p.is_file()):
-            target = path / file.relative_to(temporary)
+    with staged(path / "cameras") as folder:
+        fill(folder)
+        for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+            target = path / file.relative_to(folder)
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(file, target)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _colmap(path: Path, scene: Scene) -> None:

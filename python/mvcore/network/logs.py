@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MvcoreError
-from ..io.write import atomically
+from ..files import atomically
 
 
 def cut_log(path: Path, step: int) -> None:

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from ..errors import require
+from ..files import atomically
 from .batches import Batch, Recipe, make_batch
 from .datasets import Item, find_items
 from .folding import folded, unfolded
@@ -198,8 +199,7 @@ def train_disparity(training: Training, out: Path, device: str = "cpu", report: 
                 save_weights(found, out / "best.safetensors", {"step": str(step)})
             state = {"net": net.state_dict(), "average": average.net.state_dict(), "optimiser": optimiser.state_dict()}
             state |= {"freeze_norms": training.freeze_norms, "step": step, "best": best, "seconds": spent}
-            torch.save(state, out / "last.tmp")
-            os.replace(out / "last.tmp", last)
+            atomically(last, lambda p, state=state: torch.save(state, p))
         if timed_out or step == stop_after:
             break
     return out / "best.safetensors"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ..files import atomically
 from .logs import cut_log, log_row
 from .recognition import TargetClassifier, rank_1, squared_error
 from .targets import Target
@@ -105,8 +105,7 @@ def train_recognition(
                 best = mean
                 save_weights(net, out / "best.safetensors", {"step": str(step)})
             state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step, "best": best}
-            torch.save(state, out / "last.tmp")
-            os.replace(out / "last.tmp", last)
+            atomically(last, lambda p, state=state: torch.save(state, p))
         if step == stop_after:
             break
     return out / "best.safetensors"

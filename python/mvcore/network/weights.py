@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ..errors import FormatError
-from ..io.write import atomically
+from ..files import atomically
 from .model import DisparityNet
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError, InvalidInputError, require
+from ..files import atomically
 from .checks import Array
 from .curve import Curve
 from .search import subdivided
@@ -138,7 +139,7 @@ def save_obj(path: str | os.PathLike[str], shapes: Shape | Iterable[Shape]) -> N
             p, q = shape.degree
             lines += [f"deg {p} {q}", f"surf {a!r} {b!r} {c!r} {d!r} {numbers}"]
             lines += [_parm("u", shape.knots_u), _parm("v", shape.knots_v), "end"]
-    _write(path, "\n".join(lines) + "\n")
+    atomically(Path(path), lambda p: p.write_text("\n".join(lines) + "\n") and None)
 
 
 def _parm(name: str, knots: Array) -> str:
@@ -153,16 +154,6 @@ def _shapes(shapes: Any) -> list[Shape]:
             raise InvalidInputError(f"shapes: expected curves and surfaces, got {type(shape).__name__}")
         require(shape.control_points.shape[-1] == 3, "shapes", "three coordinates", shape.control_points.shape[-1])
     return many
-
-
-def _write(path: str | os.PathLike[str], text: str) -> None:
-    target = Path(path)
-    temporary = target.with_name(target.name + ".tmp")
-    try:
-        temporary.write_text(text)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load_obj(path: str | os.PathLike[str]) -> list[Shape]:
@@ -333,7 +324,7 @@ def save_step(path: str | os.PathLike[str], surfaces: Surface | Sequence[Surface
         f"FILE_NAME('{Path(path).name.encode('ascii', 'replace').decode()}','{now}',(''),(''),'mvcore','mvcore','');\n"
         "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n"
     )
-    _write(path, header + "\n".join(step.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n")
+    atomically(Path(path), lambda p: p.write_text(header + "\n".join(step.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n") and None)
 
 
 def _open_parts(surface: Surface) -> list[Surface]:
