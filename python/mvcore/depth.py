@@ -400,7 +400,7 @@ def refine_depth(
     """Second pass: refined at half size with the sources' own depth as a witness, then at full size.
 
     ``rough_sources`` are the first passes of the sources, one each, or empty; ``last`` says that no third pass follows. Where the
-    picture is black there is no depth.
+    picture is black or burnt out there is no depth.
     """
     config = config or DepthConfig()
     found = rough.hypotheses
@@ -473,9 +473,9 @@ EDGE_STEPS = 2.0
 
 
 def _exposed_depth(reference: View, planes: Map, margin: Map, step: float | None) -> DepthMap:
-    """The depth of planes at full size, but where the picture is black; given the step between planes, with edges on the picture's."""
+    """The depth of planes at full size, but where the picture shows nothing; given the step between planes, with edges on the picture's."""
     h, w = planes.shape[:2]
-    planes = np.where(_unexposed(reference)[..., None], np.float32(0), planes)
+    planes = np.where(_blank(reference)[..., None], np.float32(0), planes)
     if step is not None:
         known = planes[..., 0] > 0
         places = np.where(known, planes[..., 0] / np.float32(EDGE_STEPS * step), np.float32(np.nan))
@@ -484,14 +484,19 @@ def _exposed_depth(reference: View, planes: Map, margin: Map, step: float | None
     return _depth_map(planes, _resized_smoothly(margin, (h, w)))
 
 
-UNEXPOSED = 10
-"""Grey levels below which a pixel and all around it show the camera's noise and nothing else."""
+UNEXPOSED, BURNT = 10, 250
+"""Grey levels below and above which a pixel and all around it show the camera's noise and nothing else."""
+BURNT_WINDOW = 9
+"""Pixels a side of the window that is burnt out throughout: a glint is smaller, and its rim can be matched."""
 
 
-def _unexposed(view: View) -> NDArray[np.bool_]:
-    """Where a picture is black: night, a black cloth, the border that undistortion leaves. Nothing can be matched there."""
-    brightest = view.grey if view.colour is None else np.maximum.reduce(cv2.split(view.colour))
-    return np.asarray(cv2.dilate(brightest, np.ones((3, 3), np.uint8)) < UNEXPOSED)
+def _blank(view: View) -> NDArray[np.bool_]:
+    """Where nothing can be matched: black (night, a black cloth, the border that undistortion leaves) or burnt out (a lamp, the sky)."""
+    channels = [view.grey] if view.colour is None else cv2.split(view.colour)
+    brightest, darkest = np.maximum.reduce(channels), np.minimum.reduce(channels)
+    black = cv2.dilate(brightest, np.ones((3, 3), np.uint8)) < UNEXPOSED
+    burnt = cv2.erode(darkest, np.ones((BURNT_WINDOW, BURNT_WINDOW), np.uint8)) > BURNT
+    return np.asarray(black | burnt)
 
 
 def estimate_depth(reference: View, sources: Sequence[View], near: float, far: float, config: DepthConfig | None = None) -> DepthMap:
