@@ -10,6 +10,7 @@ import pytest
 import torch
 from mvcore import FormatError, InvalidInputError, _core, depth
 from mvcore.cameras import relative_map
+from mvcore.depth import pairs
 from mvcore.io.maps import write_pfm
 from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.cost import correlate, cost_space, scaled_maps, unit
@@ -29,8 +30,8 @@ SMALL = Recipe(width=96, height=64)
 @pytest.mark.parametrize(("channels", "groups", "factor"), [(32, 8, 4), (16, 8, 2), (12, 3, 4), (5, 1, 4)])
 def test_the_rust_cost_space_equals_the_torch_form(channels, groups, factor):
     torch.manual_seed(channels)
-    for pairs in (0.0, 1.0):
-        batch = make_batch(replace(SMALL, pairs=pairs), 3)
+    for share in (0.0, 1.0):
+        batch = make_batch(replace(SMALL, pairs=share), 3)
         h, w = 64 // factor, 96 // factor
         features = [unit(torch.randn(2, channels, h, w), groups) for _ in batch.images]
         span = (batch.high - batch.low)[:, None, None, None]
@@ -156,9 +157,9 @@ def test_network_sees_large_pairs_reduced_and_means_the_same_disparity(monkeypat
     batch = make_batch(Recipe(seed=5, batch=1, pairs=1.0), 1)
     pair = [np.ascontiguousarray(i[0].permute(1, 2, 0).numpy()) for i in batch.images]
     most = int(np.ceil(float(batch.high[0])))
-    full = depth._expected(pair, 0, most, "cpu")
-    monkeypatch.setattr(depth, "PAIR_SIDE", 160)
-    reduced = depth._expected(pair, 0, most, "cpu")
+    full = pairs._expected(pair, 0, most, "cpu")
+    monkeypatch.setattr(pairs, "PAIR_SIDE", 160)
+    reduced = pairs._expected(pair, 0, most, "cpu")
     assert reduced.inverse.shape == reduced.confidence.shape == full.inverse.shape
     assert reduced.inverse.flags.c_contiguous
     sure = (full.confidence > 0.9) & (reduced.confidence > 0.9)

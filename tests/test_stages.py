@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import _core
 from mvcore.config import Config, DepthConfig, SurfaceConfig, VolumeConfig
-from mvcore.depth import View, _speckles, estimate_depth, filter_depth, guided_depth, refine_depth, seeded_depth, sweep_depth
+from mvcore.depth import View, estimate_depth, filter_depth, guided_depth, refine_depth, seeded_depth, sweep_depth
+from mvcore.depth.pairs import _speckles
 from mvcore.errors import InvalidInputError, ReconstructionError
 from mvcore.io.images import read_image
 from mvcore.sparse import (
@@ -500,7 +501,7 @@ def test_disparities_have_their_edges_where_the_picture_has_them(monkeypatch):
         return float((np.abs(found - truth) > 2)[seen].mean())
 
     sharp = bad()
-    monkeypatch.setattr("mvcore.depth.MEDIAN_ROUNDS", 0)
+    monkeypatch.setattr("mvcore.depth.pairs.MEDIAN_ROUNDS", 0)
     assert sharp < 0.6 * bad()
     assert sharp < 0.03
 
