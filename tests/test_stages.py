@@ -32,7 +32,7 @@ from mvcore.sparse import (
 from mvcore.surface import Surface, cleaned, decimate, drop_small_parts, extract_surface, isosurface, marching_cubes, smooth
 from mvcore.texture import colour_gains, texture
 from mvcore.types import DepthMap, Report
-from mvcore.volume import Volume, fuse, fuse_tiles, repaired_masks, silhouette_distance
+from mvcore.volume import Volume, _Fusion, fuse, fuse_tiles, hull_share, repaired_masks, silhouette_distance
 
 
 def test_unknown_settings_name_the_nearest():
@@ -504,6 +504,32 @@ def test_disparities_have_their_edges_where_the_picture_has_them(monkeypatch):
     monkeypatch.setattr("mvcore.depth.pairs.MEDIAN_ROUNDS", 0)
     assert sharp < 0.6 * bad()
     assert sharp < 0.03
+
+
+def test_a_ball_fills_its_hull_and_a_dented_one_does_not(ring):
+    cameras, _, depths, masks = ring
+    outlines = [m.astype(np.uint8) for m in masks]
+    outside = [silhouette_distance(m) for m in outlines]
+    ball = [DepthMap(d.astype(np.float32), m.astype(np.float32)) for d, m in zip(depths, masks)]
+    assert hull_share(ball, cameras, outside) > 0.95
+    # Every view sees a deep dent in the middle of its picture.
+    inner = [cv2.erode(m, np.ones((25, 25), np.uint8)) > 0 for m in outlines]
+    dented = [DepthMap(np.where(i, d + 0.2, d).astype(np.float32), m.astype(np.float32)) for d, m, i in zip(depths, masks, inner)]
+    share = np.mean([i.sum() / m.sum() for i, m in zip(inner, masks)])
+    assert hull_share(dented, cameras, outside) == pytest.approx(1 - share, abs=0.1)
+    # What is hardly believed hardly counts.
+    doubted = [DepthMap(v.depth, np.where(i, 0.1, v.confidence).astype(np.float32)) for v, i in zip(dented, inner)]
+    assert hull_share(doubted, cameras, outside) > 0.9
+    nothing = [DepthMap(np.zeros_like(v.depth), np.zeros_like(v.depth)) for v in ball]
+    assert hull_share(nothing, cameras, outside) == 1
+    # With the same pixels unmeasured the dented one is dug out at less weight.
+    open_rows = [np.where(np.arange(180)[:, None] < 80, 0, 1).astype(np.float32)] * len(cameras)
+    box = np.array([[-0.7] * 3, [0.7] * 3])
+    weights = []
+    for maps in (ball, dented):
+        seen = [DepthMap(v.depth * o, v.confidence * o) for v, o in zip(maps, open_rows)]
+        weights.append(_Fusion.of(seen, cameras, box, outlines, VolumeConfig(), None, None).solid_weight)
+    assert 0 < weights[1] < 0.6 * weights[0]
 
 
 def test_a_hollow_volume_has_the_surface_of_the_full_one(ring):

@@ -133,7 +133,7 @@ class _Fusion:
     silhouettes: list[NDArray[np.float32]] | None
     windows: list[Window]
     complete: bool
-    open_share: float
+    solid_weight: float
     projections: NDArray[np.float64]
     bounds: Bounds
     config: VolumeConfig
@@ -152,13 +152,18 @@ class _Fusion:
     ) -> _Fusion:
         bounds = np.asarray(bounds, np.float64)
         outlines = found if masks is None else repaired_masks(depths, cameras, masks)
+        silhouettes = None if outlines is None else [silhouette_distance(m) for m in outlines]
+        solid_weight = 0.0
+        if outlines is not None and silhouettes is not None:
+            trust = hull_share(depths, cameras, silhouettes) ** 2
+            solid_weight = config.solid_share * trust * _open_share(depths, outlines) * len(depths)
         return cls(
             [d.depth for d in depths],
             [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
-            None if outlines is None else [silhouette_distance(m) for m in outlines],
+            silhouettes,
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
             masks is None and found is not None,
-            0.0 if outlines is None else _open_share(depths, outlines),
+            solid_weight,
             np.stack([c.projection for c in cameras]),
             bounds,
             config,
@@ -190,7 +195,7 @@ class _Fusion:
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
-            solid_weight=config.solid_share * self.open_share * len(self.depths),
+            solid_weight=self.solid_weight,
             smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
             measured_smoothing=config.smoothing,
             hull_tolerance=config.hull_tolerance,
@@ -307,6 +312,46 @@ def _open_share(depths: Sequence[DepthMap], masks: Sequence[NDArray[np.uint8]]) 
     """Share of the masks' pixels without depth, the mean of the views that show anything."""
     shares = [float((d.depth[m > 0] == 0).mean()) for d, m in zip(depths, masks, strict=True) if m.any()]
     return float(np.mean(shares)) if shares else 1.0
+
+
+ON_HULL = 0.01
+"""Times a target's extent: distance from the visual hull within which a point lies on it."""
+HULL_POINTS = 2000
+"""Points a view, about, by which that is judged."""
+
+
+def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.float32]]) -> float:
+    """Share of the measured surface that is the visual hull's, 1 where nothing was measured: much of a ball, little of a pickup's bed.
+
+    What the hull says where nothing was measured is as trustworthy as that. Points count by their squared confidence: where little is
+    measured, much of it is wrong.
+
+    Parameters
+    ----------
+    depths : filtered, one a camera. silhouettes : of `silhouette_distance`, one a camera.
+    """
+    clouds, weights = [], []
+    for view, camera, outside in zip(depths, cameras, silhouettes, strict=True):
+        y, x = np.nonzero((view.depth > 0) & (outside < 0))
+        step = max(1, len(x) // HULL_POINTS)
+        x, y = x[::step], y[::step]
+        clouds.append(camera.unproject(np.column_stack([x, y]), view.depth[y, x]))
+        weights.append(np.square(view.confidence[y, x], dtype=np.float64))
+    points, weight = np.concatenate(clouds), np.concatenate(weights)
+    if not weight.sum():
+        return 1.0
+    # Behind each outline a point lies as deep within the hull as in the view in which it lies nearest to the outline.
+    depth_in_hull = np.full(len(points), -np.inf)
+    for camera, outside in zip(cameras, silhouettes, strict=True):
+        q = camera.to_camera(points)
+        ahead = np.flatnonzero(q[:, 2] > 0)
+        z = q[ahead, 2]
+        x, y = np.rint((q[ahead] @ camera.K.T)[:, :2] / z[:, None]).astype(int).T
+        seen = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        distance = outside[y[seen], x[seen]] * z[seen] / camera.K[0, 0]
+        depth_in_hull[ahead[seen]] = np.maximum(depth_in_hull[ahead[seen]], distance)
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)
+    return float(weight[np.abs(depth_in_hull) < ON_HULL * np.linalg.norm(high - low)].sum() / weight.sum())
 
 
 def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
