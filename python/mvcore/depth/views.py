@@ -98,8 +98,8 @@ UNEXPOSED, BURNT = 10, 250
 """Grey levels below and above which a pixel and all around it show the camera's noise and nothing else."""
 
 
-BURNT_WINDOW = 9
-"""Pixels a side of the window that is burnt out throughout: a glint is smaller, and its rim can be matched."""
+BURNT_WINDOW = 31
+"""Pixels a side of the window that is burnt out throughout: into a glint on a helmet the depth around it continues well enough."""
 
 
 def blank(view: View) -> NDArray[np.bool_]:
