@@ -116,8 +116,8 @@ class VolumeConfig:
     """Weight of surface observations below which nothing is solid; 1 is a confident depth at the target's distance."""
     solid_share: float = 0.3
     """With silhouettes: weight of observations, a view, that overrules the solid inside of the hull; times the share of the silhouettes'
-    pixels that was not measured (where depth maps show little, what they show is doubtful), times the square of the share of what was
-    measured that lies on the hull (of a hollow thing the hull says little)."""
+    pixels that was not measured (where depth maps show little, what they show is doubtful), times the square of the share that was not
+    measured off the hull (of a hollow thing the hull says little)."""
     smoothing: float = 0.7
     """Voxels: standard deviation of the field's smoothing without masks, and with them where depth maps measured it well."""
     solid_smoothing: float = 2.0

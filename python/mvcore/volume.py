@@ -155,8 +155,10 @@ class _Fusion:
         silhouettes = None if outlines is None else [silhouette_distance(m) for m in outlines]
         solid_weight = 0.0
         if outlines is not None and silhouettes is not None:
-            trust = hull_share(depths, cameras, silhouettes) ** 2
-            solid_weight = config.solid_share * trust * _open_share(depths, outlines) * len(depths)
+            open_share = _open_share(depths, outlines)
+            # Little that was measured says little against the hull.
+            trust = 1 - (1 - open_share) * (1 - hull_share(depths, cameras, silhouettes))
+            solid_weight = config.solid_share * trust**2 * open_share * len(depths)
         return cls(
             [d.depth for d in depths],
             [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
