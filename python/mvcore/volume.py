@@ -342,7 +342,7 @@ def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouette
     points, weight = np.concatenate(clouds), np.concatenate(weights)
     if not weight.sum():
         return 1.0
-    # Behind each outline a point lies as deep within the hull as in the view in which it lies nearest to the outline.
+    # A point lies as deep within the hull as within the outline to which it is nearest.
     depth_in_hull = np.full(len(points), -np.inf)
     for camera, outside in zip(cameras, silhouettes, strict=True):
         q = camera.to_camera(points)
