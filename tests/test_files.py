@@ -44,7 +44,7 @@ def write(text):
 def test_what_a_killed_writer_left_is_gone_after_the_next(tmp_path, writer):
     writer.kill()
     writer.wait()
-    assert names(tmp_path) == [".a.txt.part"]
+    assert names(tmp_path) == [".a.txt.mvcore-part"]
     atomically(tmp_path / "a.txt", write("whole"))
     assert names(tmp_path) == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "whole"
@@ -54,8 +54,8 @@ def test_what_a_killed_writer_left_is_gone_after_the_next(tmp_path, writer):
 def test_a_busy_writer_is_not_disturbed(tmp_path, writer):
     atomically(tmp_path / "a.txt", write("ours"))
     assert (tmp_path / "a.txt").read_text() == "ours"
-    assert (tmp_path / ".a.txt.part" / "a.txt").read_text() == "half"
-    assert names(tmp_path) == [".a.txt.part", "a.txt"]
+    assert (tmp_path / ".a.txt.mvcore-part" / "a.txt").read_text() == "half"
+    assert names(tmp_path) == [".a.txt.mvcore-part", "a.txt"]
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -74,7 +74,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
 
 @locks
 def test_a_folder_that_was_left_is_empty_when_it_is_taken_over(tmp_path):
-    left = tmp_path / ".model.obj.part"
+    left = tmp_path / ".model.obj.mvcore-part"
     (left / "deep").mkdir(parents=True)
     (left / "deep" / "x").write_text("x")
     (left / "link").symlink_to(tmp_path)
@@ -82,6 +82,18 @@ def test_a_folder_that_was_left_is_empty_when_it_is_taken_over(tmp_path):
         assert folder == left
         assert not list(folder.iterdir())
     assert not names(tmp_path)
+
+
+@locks
+def test_a_link_in_the_folders_place_is_not_followed(tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "precious").write_text("x")
+    (tmp_path / ".a.txt.mvcore-part").symlink_to(elsewhere)
+    atomically(tmp_path / "a.txt", write("whole"))
+    assert (tmp_path / "a.txt").read_text() == "whole"
+    assert names(elsewhere) == ["precious"]
+    assert names(tmp_path) == [".a.txt.mvcore-part", "a.txt", "elsewhere"]
 
 
 def test_many_writers_of_one_file(tmp_path):

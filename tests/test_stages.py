@@ -515,6 +515,7 @@ def test_a_ball_fills_its_hull_and_a_dented_one_does_not(ring):
     inner = [cv2.erode(m, np.ones((25, 25), np.uint8)) > 0 for m in outlines]
     dented = [DepthMap(np.where(i, d + 0.2, d).astype(np.float32), m.astype(np.float32)) for d, m, i in zip(depths, masks, inner)]
     share = np.mean([i.sum() / m.sum() for i, m in zip(inner, masks)])
+    # Near the ball's outline in another view a dent may meet the hull again.
     assert hull_share(dented, cameras, outside) == pytest.approx(1 - share, abs=0.1)
     # What is hardly believed hardly counts.
     doubted = [DepthMap(v.depth, np.where(i, 0.1, v.confidence).astype(np.float32)) for v, i in zip(dented, inner)]

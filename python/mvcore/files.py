@@ -23,13 +23,11 @@ def staged(path: Path) -> Iterator[Path]:
     writer from a busy one; beside a busy one, and where folders cannot be locked, the folder has a name of its own.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    folder = path.parent / f".{path.name}.part"
+    folder = path.parent / f".{path.name}.mvcore-part"
     lock = _lock(folder)
     if lock is None:
         folder = Path(tempfile.mkdtemp(prefix=f"{folder.name}-", dir=path.parent))
     try:
-        for left in folder.iterdir():
-            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -38,16 +36,20 @@ def staged(path: Path) -> Iterator[Path]:
 
 
 def _lock(folder: Path) -> int | None:
-    """Make a folder, or take over one that nobody holds: its locked descriptor."""
+    """Make a folder, or take over and empty one that nobody holds: its locked descriptor; None where that cannot be."""
     if fcntl is None:
         return None
     handle = None
     try:
         folder.mkdir(exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if not os.path.samestat(os.fstat(handle), os.stat(folder)):
             raise FileNotFoundError  # its last writer removed it between the two
+        if not os.access(folder, os.W_OK):
+            raise PermissionError  # somebody else's
+        for left in folder.iterdir():
+            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
     except OSError:
         if handle is not None:
             os.close(handle)

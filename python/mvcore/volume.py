@@ -96,17 +96,22 @@ def repaired_masks(depths: Sequence[DepthMap], cameras: Sequence[Camera], masks:
     return [_repaired(m, c, [p for k, p in enumerate(points) if k != n]) for n, (m, c) in enumerate(zip(masks, cameras, strict=True))]
 
 
+def _pixels(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Which points (N, 3) fall into the image, (N,) bool, and the columns and rows of their pixels, one an image point."""
+    nearest = np.rint(camera.project(points))
+    seen = ((nearest >= 0) & (nearest < (camera.width, camera.height))).all(1)
+    x, y = nearest[seen].astype(np.int64).T
+    return seen, x, y
+
+
 def _repaired(mask: NDArray[np.uint8], camera: Camera, points: list[NDArray[np.float64]]) -> NDArray[np.uint8]:
     inside = (mask > 0).astype(np.uint8)
     hits = np.zeros(mask.shape, np.float32)
     for cloud in points:
-        q = camera.to_camera(cloud)
-        q = q[q[:, 2] > 0] @ camera.K.T
-        x = np.rint(q[:, :2] / q[:, 2:]).astype(int)
-        x = x[((x >= 0) & (x < (camera.width, camera.height))).all(1)]
+        _, x, y = _pixels(camera, cloud)
         # Each view counts once at a pixel.
         seen = np.zeros(mask.shape, np.float32)
-        seen[x[:, 1], x[:, 0]] = 1
+        seen[y, x] = 1
         hits += seen
     # A surface that one view sees squarely has one point a step squared; more than one view must have seen it.
     density = cv2.boxFilter(np.where(inside > 0, 0, hits).astype(np.float32), -1, (REACH, REACH)) * POINT_STEP**2
@@ -345,13 +350,9 @@ def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouette
     # A point lies as deep within the hull as within the outline to which it is nearest.
     depth_in_hull = np.full(len(points), -np.inf)
     for camera, outside in zip(cameras, silhouettes, strict=True):
-        q = camera.to_camera(points)
-        ahead = np.flatnonzero(q[:, 2] > 0)
-        z = q[ahead, 2]
-        x, y = np.rint((q[ahead] @ camera.K.T)[:, :2] / z[:, None]).astype(int).T
-        seen = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-        distance = outside[y[seen], x[seen]] * z[seen] / camera.K[0, 0]
-        depth_in_hull[ahead[seen]] = np.maximum(depth_in_hull[ahead[seen]], distance)
+        seen, x, y = _pixels(camera, points)
+        z = camera.to_camera(points[seen])[:, 2]
+        depth_in_hull[seen] = np.maximum(depth_in_hull[seen], outside[y, x] * z / camera.K[0, 0])
     low, high = np.quantile(points, (0.05, 0.95), axis=0)
     return float(weight[np.abs(depth_in_hull) < ON_HULL * np.linalg.norm(high - low)].sum() / weight.sum())
 

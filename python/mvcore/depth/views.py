@@ -96,14 +96,12 @@ def _unwanted(mask: NDArray[np.uint8] | None, width: int, height: int) -> NDArra
 
 UNEXPOSED, BURNT = 10, 250
 """Grey levels below and above which a pixel and all around it show the camera's noise and nothing else."""
-
-
 BURNT_WINDOW = 31
 """Pixels a side of the window that is burnt out throughout: into a glint on a helmet the depth around it continues well enough."""
 
 
 def blank(view: View) -> NDArray[np.bool_]:
-    """Where nothing can be matched: black (night, a black cloth, the border that undistortion leaves) or burnt out (a lamp, the sky)."""
+    """Where nothing can be matched, (h, w) bool: black (night, a black cloth, the border that undistortion leaves) or burnt out."""
     channels = [view.grey] if view.colour is None else cv2.split(view.colour)
     brightest, darkest = np.maximum.reduce(channels), np.minimum.reduce(channels)
     black = cv2.dilate(brightest, np.ones((3, 3), np.uint8)) < UNEXPOSED
