@@ -194,7 +194,8 @@ def test_network_disparity_fills_or_leaves_out_what_is_hidden():
     assert (full > 0).mean() > 0.99
     assert 0.2 < (checked > 0).mean() < 1
     assert np.array_equal(full[checked > 0], checked[checked > 0])
-    assert (confidence[(checked == 0) & (full > 0)] == np.float32(0.01)).all()
+    assert confidence[(checked == 0) & (full > 0)].max() <= pairs.UNSEEN
+    assert 0 <= confidence.min() <= confidence.max() <= 1
 
 
 def test_a_target_is_the_same_from_its_seed_and_differs_from_others():

@@ -11,6 +11,7 @@ import trimesh
 from conftest import write_scene
 from mvcore import InvalidInputError, ReconstructionError, metrics
 from mvcore.cli import app
+from mvcore.depth.hidden import continued
 from typer.testing import CliRunner
 
 SETTINGS = {"texture": {"least_patch": 8}}
@@ -151,9 +152,42 @@ def test_disparity_of_a_synthetic_pair_and_its_errors():
         mvcore.disparity(left, right, max_disparity=0)
 
 
-def test_middlebury_is_no_worse_than_opencv(shared):
+def test_slanted_surfaces_go_on_where_one_image_alone_shows_them():
+    rng = np.random.default_rng(4)
+    guide = rng.integers(0, 80, (60, 120, 3), np.uint8)
+    guide[:, 70:] += 150
+    x = np.arange(120, dtype=np.float32)
+    # A slanted wall, and before it from column 70 on a box that hides the wall to its left.
+    truth = np.broadcast_to(np.where(x < 70, 8 + 0.1 * x, 40), (60, 120)).astype(np.float32)
+    seen = np.broadcast_to((x >= 24) & ((x < 50) | (x >= 70)), truth.shape)
+    found = continued(np.where(seen, truth, 1).astype(np.float32), seen, guide, 0, 64)
+    assert np.array_equal(found[seen], truth[seen])
+    assert np.abs(found - truth).max() < 0.3
+    nothing = np.zeros_like(seen)
+    assert np.array_equal(continued(np.full_like(truth, 3), nothing, guide, 0, 64), np.full_like(truth, 3))
+    # Slopes end at the range, and pictures narrower than a slope's reach have none.
+    assert continued(np.where(seen, truth, 1).astype(np.float32), seen, guide, 10, 64).min() == 10
+    narrow = np.zeros((4, 9), bool)
+    narrow[:, 4:] = True
+    assert np.array_equal(continued(np.full((4, 9), 2, np.float32), narrow, guide[:4, :9], 0, 64), np.full((4, 9), 2, np.float32))
+
+
+def test_disparity_outside_the_right_image_follows_a_slanted_wall():
+    rng = np.random.default_rng(7)
+    texture = cv2.GaussianBlur(rng.integers(0, 255, (120, 260), np.uint8), (0, 0), 1.2)
+    right = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+    x, y = np.meshgrid(np.arange(260, dtype=np.float32), np.arange(120, dtype=np.float32))
+    truth = (46 - 0.15 * x).astype(np.float32)
+    left = cv2.remap(right, x - truth, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    found, confidence = mvcore.disparity(left, right, max_disparity=64)
+    outside = (x < truth - 2) & (y > 5) & (y < 114)
+    assert np.median(np.abs(found - truth)[outside]) < 1
+    assert (confidence[outside] < 0.5).all()
+
+
+def test_middlebury_is_no_worse_than_opencv_and_confidence_tells_what_is_wrong(shared):
     sets = shared / "middlebury-stereo"
-    ours, theirs = [], []
+    ours, theirs, told = [], [], []
     for name, left, right, true, scale, most in (
         ("cone", "im2.png", "im6.png", "disp2.png", 4, 64),
         ("teddy", "im2.png", "im6.png", "disp2.pgm", 4, 64),
@@ -161,11 +195,15 @@ def test_middlebury_is_no_worse_than_opencv(shared):
         read = lambda n, kind: cv2.imread(str(sets / name / n), kind)  # noqa: B023, E731
         a, b = read(left, cv2.IMREAD_COLOR), read(right, cv2.IMREAD_COLOR)
         truth = read(true, cv2.IMREAD_GRAYSCALE).astype(np.float32) / scale
-        found, _ = mvcore.disparity(a[..., ::-1].copy(), b[..., ::-1].copy(), max_disparity=most)
+        found, confidence = mvcore.disparity(a[..., ::-1].copy(), b[..., ::-1].copy(), max_disparity=most)
+        wrong = (np.abs(found - truth) > 2)[truth > 0]
+        doubtful = confidence[truth > 0] <= np.quantile(confidence[truth > 0], 0.1)
+        told.append(wrong[doubtful].sum() / wrong.sum())
         peer = cv2.StereoSGBM_create(0, most, 5, 8 * 75, 32 * 75, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH).compute(a, b) / 16
         ours.append(metrics.disparity_metrics(found, truth)["bad_2"])
         theirs.append(metrics.disparity_metrics(peer, truth)["bad_2"])
     assert np.mean(ours) <= np.mean(theirs)
+    assert min(told) > 1 / 3
 
 
 def test_commands(ring, tmp_path):

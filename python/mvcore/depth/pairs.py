@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..config import MATCHERS, DepthConfig
 from ..errors import require
+from .hidden import continued
 from .planes import MEDIAN_RADIUS, MEDIAN_ROUNDS, NO_BACKS, Expected, sharpened, sweep_scale
 from .views import Grey, Map, Scale, resized_nearest
 
@@ -31,13 +32,13 @@ def disparity(
     ----------
     left, right : (h, w) or (h, w, 3) uint8, the same size.
     max_disparity, min_disparity : pixels; a point at column x of the left image stands at x - d of the right one.
-    fill : replace what the right image does not confirm by the surrounding background; otherwise it is 0.
+    fill : replace what the right image does not confirm by the background's surface beside it; otherwise it is 0.
     matcher : ``sgm``, or ``dcnn`` for the network beside it.
     device : ``cpu`` or ``cuda``, of the network.
 
     Returns
     -------
-    disparity, confidence : (h, w) float32, pixels and 0 .. 1.
+    disparity, confidence : (h, w) float32, pixels and 0 .. 1: `_confidence`, with ``dcnn`` times the network's.
 
     Examples
     --------
@@ -59,10 +60,25 @@ def disparity(
     theirs = _rectified(*flipped, min_disparity, max_disparity, config)
     d = mine[..., 0]
     seen = _confirmed(d, theirs[:, ::-1, 0]) & ~_speckles(d)
-    cost = mine[..., 3]
-    confidence = np.where(seen, np.clip(1 - cost, 0.02, 1), 0.01).astype(np.float32)
-    found = sharpened(_fill_occlusions(d, seen, images[0]), ~seen, _three_channels(left), MEDIAN_RADIUS, MEDIAN_ROUNDS)
-    return found if fill else np.where(seen, found, 0).astype(np.float32), confidence
+    guide = np.ascontiguousarray(_three_channels(left))
+    found = sharpened(continued(d, seen, guide, min_disparity, max_disparity), ~seen, guide, MEDIAN_RADIUS, MEDIAN_ROUNDS)
+    confidence = _confidence(found, seen) * (1 if expected is None else expected.confidence)
+    return found if fill else np.where(seen, found, 0).astype(np.float32), confidence.astype(np.float32)
+
+
+EDGE, JUMP = 4.0, 2.0
+"""Pixels from an edge of depth at which confidence has risen to 1 - 1 / e, and the least disparity between neighbours that is one."""
+UNSEEN, ALONE = 0.5, 8.0
+"""Confidence in what one image alone shows, and the pixels from what both show at which it has halved."""
+
+
+def _confidence(d: Map, seen: NDArray[np.bool_]) -> Map:
+    """0 .. 1: low at edges of depth and beyond what both images show, where most errors are. What the photographs cost tells less."""
+    around = np.ones((3, 3), np.uint8)
+    jump = cv2.dilate(d, around) - cv2.erode(d, around) > JUMP
+    from_edge, from_seen = (cv2.distanceTransform(np.uint8(~m), cv2.DIST_L2, 3) for m in (jump, seen))
+    alone = np.where(seen, 1, UNSEEN / (1 + from_seen / ALONE))
+    return (alone * (1 - np.exp(-from_edge / EDGE))).astype(np.float32)
 
 
 def _confirmed(d: Map, other: Map) -> NDArray[np.bool_]:
@@ -127,17 +143,3 @@ def _rectified(left: Grey, right: Grey, low: int, high: int, config: DepthConfig
     # A pair's sweep runs at full size: its ranges are short and its details fine.
     scale = Scale([left, right], RECTIFIED, NO_BACKS, 1.0)
     return sweep_scale(scale, float(low), float(high), high - low + 1, config, expected).planes
-
-
-def _fill_occlusions(d: Map, seen: NDArray[np.bool_], guide: Grey) -> Map:
-    """What one image alone shows lies behind: take the lower of the nearest confirmed disparities left and right."""
-    h, w = d.shape
-    columns = np.broadcast_to(np.arange(w), (h, w))
-    left = np.maximum.accumulate(np.where(seen, columns, -1), 1)
-    right = np.minimum.accumulate(np.where(seen, columns, w)[:, ::-1], 1)[:, ::-1]
-    at_left = np.where(left >= 0, np.take_along_axis(d, left.clip(0), 1), np.inf)
-    at_right = np.where(right < w, np.take_along_axis(d, right.clip(None, w - 1), 1), np.inf)
-    lower = np.minimum(at_left, at_right)
-    filled = np.where(seen | ~np.isfinite(lower), d, lower).astype(np.float32)
-    smooth = cv2.medianBlur(filled, 5)
-    return np.where(seen, filled, smooth).astype(np.float32)
