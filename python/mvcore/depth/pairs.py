@@ -38,7 +38,7 @@ def disparity(
 
     Returns
     -------
-    disparity, confidence : (h, w) float32, pixels and 0 .. 1: `_confidence`, with ``dcnn`` times the network's.
+    disparity, confidence : (h, w) float32, pixels and 0 .. 1.
 
     Examples
     --------
@@ -62,23 +62,31 @@ def disparity(
     seen = _confirmed(d, theirs[:, ::-1, 0]) & ~_speckles(d)
     guide = np.ascontiguousarray(_three_channels(left))
     found = sharpened(continued(d, seen, guide, min_disparity, max_disparity), ~seen, guide, MEDIAN_RADIUS, MEDIAN_ROUNDS)
-    confidence = _confidence(found, seen) * (1 if expected is None else expected.confidence)
-    return found if fill else np.where(seen, found, 0).astype(np.float32), confidence.astype(np.float32)
+    confidence = _confidence(found, seen, expected)
+    return found if fill else np.where(seen, found, 0).astype(np.float32), confidence
 
 
 EDGE, JUMP = 4.0, 2.0
 """Pixels from an edge of depth at which confidence has risen to 1 - 1 / e, and the least disparity between neighbours that is one."""
 UNSEEN, ALONE = 0.5, 8.0
 """Confidence in what one image alone shows, and the pixels from what both show at which it has halved."""
+AGREE = 3.0
+"""Disparity between ours and the network's at which confidence has fallen to 1 / e."""
 
 
-def _confidence(d: Map, seen: NDArray[np.bool_]) -> Map:
-    """0 .. 1: low at edges of depth and beyond what both images show, where most errors are. What the photographs cost tells less."""
+def _confidence(d: Map, seen: NDArray[np.bool_], expected: Expected | None) -> Map:
+    """0 .. 1: low at edges of depth and beyond what both images show, where most errors are; what the photographs cost tells less.
+
+    And low where the network is unsure, or sure of something else.
+    """
     around = np.ones((3, 3), np.uint8)
     jump = cv2.dilate(d, around) - cv2.erode(d, around) > JUMP
     from_edge, from_seen = (cv2.distanceTransform(np.uint8(~m), cv2.DIST_L2, 3) for m in (jump, seen))
     alone = np.where(seen, 1, UNSEEN / (1 + from_seen / ALONE))
-    return (alone * (1 - np.exp(-from_edge / EDGE))).astype(np.float32)
+    confidence = alone * (1 - np.exp(-(from_edge + 1) / EDGE))
+    if expected is not None:
+        confidence = confidence * expected.confidence * np.exp(-np.abs(d - expected.inverse) / AGREE)
+    return confidence.astype(np.float32)
 
 
 def _confirmed(d: Map, other: Map) -> NDArray[np.bool_]:
