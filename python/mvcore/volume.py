@@ -121,8 +121,10 @@ def _repaired(mask: NDArray[np.uint8], camera: Camera, points: list[NDArray[np.f
     solid = cv2.morphologyEx(cv2.morphologyEx(doubted, cv2.MORPH_CLOSE, small), cv2.MORPH_OPEN, large)
     if not solid.any():
         return inside
-    # What hangs on it in slits of the mask, a post say, and the rim between it and the mask.
-    slits = cv2.morphologyEx(inside, cv2.MORPH_CLOSE, small) & doubted
+    # What hangs on it in slits of the mask, with some of it on both sides, a post say; and the rim between it and the mask.
+    across = np.eye(2 * REACH + 1, dtype=np.uint8)
+    lines = (across, across[::-1].copy(), np.ones((1, len(across)), np.uint8), np.ones((len(across), 1), np.uint8))
+    slits = np.bitwise_or.reduce([cv2.morphologyEx(inside, cv2.MORPH_CLOSE, line) for line in lines]) & doubted
     _, part = cv2.connectedComponents(solid | slits)
     filled = inside | solid | (np.isin(part, np.unique(part[solid > 0])) & (slits > 0)).astype(np.uint8)
     around = cv2.dilate(solid, small, iterations=2)
