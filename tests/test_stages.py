@@ -15,6 +15,7 @@ from mvcore.depth.pairs import _speckles
 from mvcore.errors import InvalidInputError, ReconstructionError
 from mvcore.io.images import read_image
 from mvcore.sparse import (
+    CalibrationError,
     calibration_error,
     candidate_pairs,
     check_calibration,
@@ -25,13 +26,14 @@ from mvcore.sparse import (
     detect,
     find_points,
     fundamental,
+    match_and_triangulate,
     surrounds,
     target_box,
     view_scores,
 )
 from mvcore.surface import Surface, cleaned, decimate, drop_small_parts, extract_surface, isosurface, marching_cubes, smooth
 from mvcore.texture import colour_gains, texture
-from mvcore.types import DepthMap, Report
+from mvcore.types import DepthMap, Report, SparsePoints
 from mvcore.volume import Volume, _Fusion, fuse, fuse_tiles, hull_share, repaired_masks, silhouette_distance
 
 
@@ -78,14 +80,33 @@ def test_a_wrong_calibration_is_refused_and_a_doubtful_one_is_said(sample):
     def check(degrees):
         r = cv2.Rodrigues(np.radians(degrees) * np.array([0.8, 0.5, 0.3]))[0]
         turned = [mvcore.Camera(c.K, (r if n % 2 else r.T) @ c.R, c.t, c.width, c.height) for n, c in enumerate(cameras)]
-        report = Report()
-        check_calibration(*calibration_error(turned, features, pairs), turned, Config().sparse, report)
+        report, config = Report(), Config().sparse
+        error = calibration_error(turned, features, pairs)
+        points = match_and_triangulate(turned, features, pairs, config.band, config)
+        check_calibration(error, points, turned, config, report)
         return report
 
     assert not check(0.0).warnings
     assert "doubtful" in check(0.25).warnings[0]
     with pytest.raises(ReconstructionError, match="does not fit the images"):
         check(2.0)
+
+
+def test_a_pattern_that_repeats_does_not_refuse_a_calibration_that_many_points_fit(ring):
+    cameras = ring[0][:4]
+    config, wrong = Config().sparse, CalibrationError(30.0, [30.0] * 4, np.repeat([1.0, 30.0], [20, 100]))
+
+    def check(points, views):
+        visible = np.zeros((4, points), bool)
+        visible[:views] = True
+        report = Report()
+        check_calibration(wrong, SparsePoints(np.zeros((points, 3)), visible, np.zeros(points, np.float32)), cameras, config, report)
+        return report
+
+    assert "50 points of three and more views fit it" in check(50, 3).warnings[0]
+    for points, views in ((49, 3), (200, 2), (0, 3)):
+        with pytest.raises(ReconstructionError, match="does not fit the images"):
+            check(points, views)
 
 
 def test_textureless_scenes_fall_back_to_the_common_volume(ring):

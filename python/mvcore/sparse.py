@@ -99,13 +99,20 @@ def match(a: Features, b: Features, f: Float, band: float, ratio: float) -> NDAr
     return _core.match_epipolar(a.positions, a.descriptors, b.positions, b.descriptors, f, band, ratio)
 
 
-def calibration_error(
-    cameras: Sequence[Camera], features: Sequence[Features], pairs: Sequence[tuple[int, int]]
-) -> tuple[float | None, list[float | None]]:
-    """Median epipolar error in pixels of matches found *without* the calibration: (over all, of each view).
+@dataclass(frozen=True)
+class CalibrationError:
+    """Epipolar errors in pixels of matches found *without* the calibration.
 
-    None where fewer than 20 such matches exist. Only the surest matches count: mutual, with a ratio below 0.7.
+    overall, by_view : medians; None where fewer than 20 such matches exist. errors : (n,) of each match.
     """
+
+    overall: float | None
+    by_view: list[float | None]
+    errors: Float
+
+
+def calibration_error(cameras: Sequence[Camera], features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> CalibrationError:
+    """How far the calibration is from the images. Only the surest matches count: mutual, with a ratio below 0.7."""
     by_view: list[list[Float]] = [[] for _ in cameras]
     everything = []
     nearest = sorted(pairs, key=lambda p: np.arccos(np.clip(cameras[p[0]].axis @ cameras[p[1]].axis, -1, 1)))
@@ -128,19 +135,36 @@ def calibration_error(
         values = np.concatenate(parts) if parts else np.zeros(0)
         return float(np.median(values)) if len(values) >= 20 else None
 
-    return median(everything), [median(parts) for parts in by_view]
+    errors = np.concatenate(everything) if everything else np.zeros(0)
+    return CalibrationError(median(everything), [median(parts) for parts in by_view], errors)
+
+
+SUPPORT = 1.5
+"""Observations of points of three and more views, for each match that contradicts the calibration, at which the match is not believed."""
 
 
 def check_calibration(
-    overall: float | None, by_view: Sequence[float | None], cameras: Sequence[Camera], config: SparseConfig, report: Report
+    found: CalibrationError, points: SparsePoints, cameras: Sequence[Camera], config: SparseConfig, report: Report
 ) -> None:
-    """Warn above ``warn_error`` pixels, raise above ``fail_error``, naming the views that are off."""
+    """Warn above ``warn_error`` pixels, raise above ``fail_error``, naming the views that are off.
+
+    A pattern that repeats, on a tiled floor say, matches itself a few tiles off, and all such matches of two views fit some wrong geometry.
+    Points that three and more views agree on, found with the calibration, come by chance where it is wrong: where there are many it stands.
+    """
+    overall, by_view = found.overall, found.by_view
     report.values["calibration"] = {"median_epipolar_error_px": overall, "by_view_px": list(by_view)}
     if overall is None:
         report.warn("too few sure matches to check the calibration")
         return
     off = [(e, n) for n, e in enumerate(by_view) if e is not None and e > config.warn_error]
     worst = ", ".join(f"view {n} ({cameras[n].name or 'unnamed'}) {e:.1f} px" for e, n in sorted(off, reverse=True)[:5])
+    views = points.visible.sum(0)
+    if overall > config.fail_error and views[views >= 3].sum() >= SUPPORT * (found.errors > config.fail_error).sum():
+        report.warn(
+            f"matches found without the calibration miss it by {overall:.1f} px, yet {(views >= 3).sum()} points of three and more views "
+            "fit it: the images seem to repeat a pattern, or some views are off"
+        )
+        return
     if overall > config.fail_error:
         some = len(off) < 0.7 * len(by_view)
         why = (
@@ -224,6 +248,21 @@ def triangulate(cameras: Sequence[Camera], features: Sequence[Features], rows: N
     return SparsePoints(points[keep], visible[:, keep], mean[keep].astype(np.float32))
 
 
+def match_and_triangulate(
+    cameras: Sequence[Camera],
+    features: Sequence[Features],
+    pairs: Sequence[tuple[int, int]],
+    band: float,
+    config: SparseConfig,
+    track: Track = no_track,
+) -> SparsePoints:
+    """Points of the features that match within ``band`` pixels of the epipolar lines."""
+    links = []
+    for i, j in track(pairs, "matches", len(pairs)):
+        links.append((i, j, match(features[i], features[j], fundamental(cameras[i], cameras[j]), band, config.ratio)))
+    return triangulate(cameras, features, _tracks(links, [len(f.positions) for f in features]), config)
+
+
 def find_points(
     images: Sequence[Image],
     cameras: Sequence[Camera],
@@ -237,7 +276,7 @@ def find_points(
     Raises
     ------
     ReconstructionError
-        The calibration misses the images by more than ``config.fail_error`` pixels.
+        The calibration misses the images by more than ``config.fail_error`` pixels, and few points fit it.
     """
     config, report = config or SparseConfig(), report or Report()
     features = [
@@ -245,14 +284,12 @@ def find_points(
         for n, image in enumerate(track(images, "features", len(images)))
     ]
     pairs = candidate_pairs(cameras, config.neighbours)
-    overall, by_view = calibration_error(cameras, features, pairs)
-    check_calibration(overall, by_view, cameras, config, report)
-    band = max(config.band, 2.0 * (overall or 0.0))
-    links = []
-    for i, j in track(pairs, "matches", len(pairs)):
-        links.append((i, j, match(features[i], features[j], fundamental(cameras[i], cameras[j]), band, config.ratio)))
-    rows = _tracks(links, [len(f.positions) for f in features])
-    points = triangulate(cameras, features, rows, config)
+    found = calibration_error(cameras, features, pairs)
+    # An error of a few pixels is worth a wider band; a larger one means that the matches or the calibration are wrong.
+    error = found.overall or 0.0
+    band = max(config.band, 2.0 * error) if error <= config.fail_error else config.band
+    points = match_and_triangulate(cameras, features, pairs, band, config, track)
+    check_calibration(found, points, cameras, config, report)
     report.values["sparse"] = {
         "features": sum(len(f.positions) for f in features),
         "pairs": len(pairs),
