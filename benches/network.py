@@ -69,6 +69,22 @@ def size(arguments):
 def heldout(arguments):
     net = load_disparity(arguments.weights)
     print({k: round(v, 4) for k, v in validate(net, Recipe().seed, torch.device("cpu"), 40).items()})
+    errors = {m: [] for m in MATCHERS}
+    for n in range(20):
+        for left, right, true, most in _pairs_of(make_batch(Recipe(seed=Recipe().seed + 1_000_000, held_out=True, pairs=1.0), n)):
+            for matcher, parts in errors.items():
+                found, _ = mvcore.disparity(left, right, max_disparity=most, matcher=matcher)
+                parts.append(np.abs(found - true)[(true > 0) & (true <= most)])
+    for matcher, parts in errors.items():
+        means = [e.mean() for e in parts]
+        print(f"pairs, {matcher}: mean error {np.concatenate(parts).mean():.2f} px, of the median pair {np.median(means):.2f} px")
+
+
+def _pairs_of(batch):
+    """Left and right image, true disparity and its upper end, of each pair of a batch."""
+    for k in range(len(batch.inverse)):
+        left, right = (i[k].permute(1, 2, 0).contiguous().numpy() for i in batch.images)
+        yield left, right, batch.inverse[k].numpy(), int(np.ceil(float(batch.high[k])))
 
 
 def _compared(matcher, pairs):
@@ -163,25 +179,33 @@ def confidence(arguments):
 
     net = load_disparity(arguments.weights)
     figure = Figure((5, 4), layout="constrained")
-    axes = figure.add_subplot(xlabel="share of pixels kept, most confident first", ylabel="share of them off by more than a plane")
-    for name, pairs in (("pairs", 1.0), ("views", 0.0)):
-        recipe = Recipe(seed=1_000_001, held_out=True, pairs=pairs)
-        wrong, sure = [], []
-        for n in range(30):
-            batch = replace(make_batch(recipe, n), planes=32)
+    axes = figure.add_subplot(xlabel="share of pixels kept, most confident first", ylabel="share of them that are bad")
+    seen = {"pairs, network alone, 2 px": [], "pairs, dcnn, 2 px": [], "pairs, sgm, 2 px": [], "views, network alone, a plane": []}
+    for n in range(30):
+        for share in (1.0, 0.0):
+            batch = replace(make_batch(Recipe(seed=1_000_001, held_out=True, pairs=share), n), planes=32)
             with torch.no_grad():
                 found = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
             known = (batch.inverse > batch.low[:, None, None]) & (batch.inverse <= batch.high[:, None, None])
-            step = ((batch.high - batch.low) / 31)[:, None, None]
-            wrong.append((((found.inverse - batch.inverse).abs() / step) > 1)[known])
-            sure.append(found.confidence[known])
-        bad, order = torch.cat(wrong).double(), torch.cat(sure).argsort(descending=True)
-        kept = torch.arange(1, len(bad) + 1)
-        curve = bad[order].cumsum(0) / kept
-        tenth = int(0.9 * len(bad))
-        removed = 1 - float(bad[order][:tenth].sum() / bad.sum())
+            if share == 0.0:
+                step = ((batch.high - batch.low) / 31)[:, None, None]
+                wrong = ((found.inverse - batch.inverse).abs() / step) > 1
+                seen["views, network alone, a plane"].append((wrong[known].numpy(), found.confidence[known].numpy()))
+                continue
+            seen["pairs, network alone, 2 px"].append(
+                (((found.inverse - batch.inverse).abs() > 2)[known].numpy(), found.confidence[known].numpy())
+            )
+            for (left, right, true, most), on in zip(_pairs_of(batch), known.numpy(), strict=True):
+                for matcher in MATCHERS:
+                    d, sure = mvcore.disparity(left, right, max_disparity=most, matcher=matcher)
+                    seen[f"pairs, {matcher}, 2 px"].append(((np.abs(d - true) > 2)[on], sure[on]))
+    for name, parts in seen.items():
+        wrong, sure = (np.concatenate(p) for p in zip(*parts, strict=True))
+        bad = wrong[np.argsort(-sure, kind="stable")]
+        kept = np.arange(1, len(bad) + 1)
+        removed = 1 - bad[: int(0.9 * len(bad))].sum() / bad.sum()
         print(f"{name}: {100 * bad.mean():.1f} % bad; the least confident tenth holds {100 * removed:.0f} % of them")
-        axes.plot(kept[::1000] / len(bad), curve[::1000], label=name)
+        axes.plot(kept[::1000] / len(bad), (bad.cumsum() / kept)[::1000], label=name)
     axes.legend()
     figure.savefig(arguments.folders[0], dpi=100)
 
