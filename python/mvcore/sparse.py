@@ -162,7 +162,7 @@ def check_calibration(
     if overall > config.fail_error and views[views >= 3].sum() >= SUPPORT * (found.errors > config.fail_error).sum():
         report.warn(
             f"matches found without the calibration miss it by {overall:.1f} px, yet {(views >= 3).sum()} points of three and more views "
-            "fit it: the images seem to repeat a pattern, or some views are off"
+            f"fit it: the images seem to repeat a pattern, or these views are off: {worst}"
         )
         return
     if overall > config.fail_error:
