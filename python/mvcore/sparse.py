@@ -158,14 +158,14 @@ def check_calibration(
         return
     off = [(e, n) for n, e in enumerate(by_view) if e is not None and e > config.warn_error]
     worst = ", ".join(f"view {n} ({cameras[n].name or 'unnamed'}) {e:.1f} px" for e, n in sorted(off, reverse=True)[:5])
-    views = points.visible.sum(0)
-    if overall > config.fail_error and views[views >= 3].sum() >= SUPPORT * (found.errors > config.fail_error).sum():
-        report.warn(
-            f"matches found without the calibration miss it by {overall:.1f} px, yet {(views >= 3).sum()} points of three and more views "
-            f"fit it: the images seem to repeat a pattern, or these views are off: {worst}"
-        )
-        return
     if overall > config.fail_error:
+        views = points.visible.sum(0)
+        if views[views >= 3].sum() >= SUPPORT * (found.errors > config.fail_error).sum():
+            report.warn(
+                f"matches found without the calibration miss it by {overall:.1f} px, yet {(views >= 3).sum()} points of three and more "
+                f"views fit it: the images seem to repeat a pattern, or these views are off: {worst}"
+            )
+            return
         some = len(off) < 0.7 * len(by_view)
         why = (
             "the poses of these views"

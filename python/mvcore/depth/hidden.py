@@ -23,8 +23,10 @@ def continued(d: Map, seen: NDArray[np.bool_], guide: NDArray[np.uint8], low: fl
     """Disparities with those that are not seen replaced: of the nearest seen surfaces left and right the one behind goes on.
 
     d : (h, w) float32; seen : (h, w), what both images show; guide : (h, w, 3) uint8, the left image; low, high : the range searched.
-    A whole row that is not seen keeps what it has. At the border beyond the right image's, where one side alone is seen, a slanted
-    surface that stayed at its last disparity would be off by more the farther it goes.
+    Returns (h, w) float32, pixels. A whole row that is not seen keeps what it has.
+
+    Beyond the right image's border one side alone is seen: a slanted surface that stayed at its last disparity would be off by more the
+    farther it goes.
     """
     h, w = d.shape
     columns = np.broadcast_to(np.arange(w), (h, w))
