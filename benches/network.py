@@ -24,14 +24,16 @@ import mvcore
 import numpy as np
 import torch
 from mvcore import depth as depth_stage
-from mvcore import metrics, sparse
 from mvcore.config import MATCHERS, Config
+from mvcore.evaluation import metrics
 from mvcore.io.images import load_frame
-from mvcore.network import match
-from mvcore.network.batches import Recipe, make_batch
-from mvcore.network.match import SHIPPED, Matcher, planes_for, shipped_matcher
-from mvcore.network.train_disparity import Training, train_disparity, validate
+from mvcore.network import matcher as match
+from mvcore.network.matcher import SHIPPED, Matcher, planes_for, shipped_matcher
+from mvcore.network.training.batches import Recipe, make_batch
+from mvcore.network.training.train_disparity import Training, train_disparity, validate
 from mvcore.network.weights import load_disparity
+from mvcore.sparse import points as sparse
+from mvcore.sparse import view_selection
 from peers import PAIRS
 
 
@@ -152,9 +154,9 @@ def views(arguments):
         cameras = [c.pinhole() for c in scene.calib]
         images = [load_frame(f, c, n) for n, (f, c) in enumerate(zip(scene.frames, scene.calib, strict=True))]
         points = sparse.find_points(images, cameras)
-        box = sparse.target_box(cameras, points)
-        ranges = sparse.depth_ranges(cameras, points, box, config.sparse.range_stretch, False)
-        sources = sparse.choose_sources(sparse.view_scores(cameras, points, box, config.depth), config.depth.sources)
+        box = view_selection.target_box(cameras, points)
+        ranges = view_selection.depth_ranges(cameras, points, box, config.sparse.range_stretch, False)
+        sources = view_selection.choose_sources(view_selection.view_scores(cameras, points, box, config.depth), config.depth.sources)
         gray = [depth_stage.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
         scale = json.loads((folder / "cameras.json").read_text())["depth_scale"]
         shares = {"network alone": [], "dcnn": [], "sgm": []}

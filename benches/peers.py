@@ -14,11 +14,12 @@ from pathlib import Path
 import cv2
 import mvcore
 import numpy as np
-from mvcore import _core, metrics
+from mvcore import _core
 from mvcore.config import VolumeConfig
-from mvcore.surface import isosurface, marching_cubes
+from mvcore.evaluation import metrics
+from mvcore.mesh.surface import isosurface, marching_cubes
 from mvcore.types import DepthMap
-from mvcore.volume import fuse
+from mvcore.volume.tsdf import fuse
 
 
 def median(job, repeats=5):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mvcore
 
-SAMPLE = Path(mvcore.__file__).parent / "sample"
+SAMPLE = Path(mvcore.__file__).parent / "cli" / "sample"
 
 
 def main(scene_path=SAMPLE, output="pickup.glb"):

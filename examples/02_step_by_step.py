@@ -8,11 +8,15 @@ from pathlib import Path
 
 import cv2
 import mvcore
-from mvcore import depth, sparse, surface, volume
+from mvcore import depth
 from mvcore.config import DepthConfig
 from mvcore.io.images import load_frame, undistort
+from mvcore.mesh import surface
+from mvcore.sparse import points as sparse
+from mvcore.sparse import view_selection
+from mvcore.volume import tsdf as volume
 
-SAMPLE = Path(mvcore.__file__).parent / "sample"
+SAMPLE = Path(mvcore.__file__).parent / "cli" / "sample"
 
 
 def main(scene_path=SAMPLE, output="pickup.ply"):
@@ -21,9 +25,9 @@ def main(scene_path=SAMPLE, output="pickup.ply"):
     cameras = [c.pinhole() for c in scene.calib]
 
     points = sparse.find_points(images, cameras)
-    box = sparse.target_box(cameras, points)
-    ranges = sparse.depth_ranges(cameras, points, box, stretch=0.25, bounded=False)
-    sources = sparse.choose_sources(sparse.view_scores(cameras, points, box, DepthConfig()), 4)
+    box = view_selection.target_box(cameras, points)
+    ranges = view_selection.depth_ranges(cameras, points, box, stretch=0.25, bounded=False)
+    sources = view_selection.choose_sources(view_selection.view_scores(cameras, points, box, DepthConfig()), 4)
 
     views = [depth.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c) for i, c in zip(images, cameras, strict=True)]
     found = [depth.estimate_depth(views[n], [views[j] for j in s], *ranges[n]) for n, s in enumerate(sources)]

@@ -24,7 +24,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def sample() -> Path:
-    return ROOT / "python" / "mvcore" / "sample"
+    return ROOT / "python" / "mvcore" / "cli" / "sample"
 
 
 def look_at(center, target, size=(240, 180), focal=225.0, up=(0.0, 0.0, 1.0)) -> mvcore.Camera:

@@ -4,7 +4,7 @@ from conftest import look_at
 from hypothesis import given
 from hypothesis import strategies as st
 from mvcore import Calibration, Camera, InvalidInputError
-from mvcore.cameras import euler_to_rotation, relative_map, rotation_to_euler
+from mvcore.geometry.cameras import euler_to_rotation, relative_map, rotation_to_euler
 
 K = [[500.0, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
 angle = st.floats(-3.1, 3.1)

@@ -5,10 +5,11 @@ from conftest import look_at, render_target, rig
 from hypothesis import given
 from hypothesis import strategies as st
 from mvcore import Config, InvalidInputError, ReconstructionError, _core
-from mvcore.carve import carve_silhouettes, dense, photo_hull, shadow, sparse_volume, supported, target_hull, visual_hull
 from mvcore.config import CarveConfig, VolumeConfig
-from mvcore.metrics import mesh_metrics
-from mvcore.surface import extract_surface, isosurface
+from mvcore.evaluation.metrics import mesh_metrics
+from mvcore.mesh.surface import extract_surface, isosurface
+from mvcore.silhouettes.visual_hull import carve_silhouettes, shadow, supported, target_hull
+from mvcore.volume.photo_hull import dense, photo_hull, sparse_volume, visual_hull
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
 

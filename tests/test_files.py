@@ -6,13 +6,13 @@ import sys
 import threading
 
 import pytest
-from mvcore.files import atomically, fcntl, staged
+from mvcore.io.files import atomically, fcntl, staged
 
 locks = pytest.mark.skipif(fcntl is None, reason="folders are not locked here")
 WRITER = """
 import sys, time
 from pathlib import Path
-from mvcore.files import atomically
+from mvcore.io.files import atomically
 def write(path):
     path.write_text("half")
     print("writing", flush=True)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from conftest import look_at
 from mvcore import FormatError, InvalidInputError, Scene
-from mvcore.io import maps, mvsnet
-from mvcore.io.colmap import quaternion_to_rotation, rotation_to_quaternion
+from mvcore.io import maps
+from mvcore.io.formats import mvsnet
+from mvcore.io.formats.colmap import quaternion_to_rotation, rotation_to_quaternion
 from mvcore.io.images import load_frame, undistort
 
 POINT = np.array([[0.12, -0.2, 0.17]])

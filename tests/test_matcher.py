@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 import torch
 from mvcore import FormatError, InvalidInputError, _core, depth
-from mvcore.cameras import relative_map
-from mvcore.depth import pairs
+from mvcore.depth import stereo as pairs
+from mvcore.geometry.cameras import relative_map
 from mvcore.io.maps import write_pfm
-from mvcore.network.batches import Recipe, make_batch
 from mvcore.network.cost import correlate, cost_space, scaled_maps, unit
-from mvcore.network.datasets import LAYOUTS, cropped, find_items
 from mvcore.network.folding import folded, unfolded
-from mvcore.network.logs import plot_log
-from mvcore.network.match import MOST_SEEN, Matcher, padded
+from mvcore.network.matcher import MOST_SEEN, Matcher, padded
 from mvcore.network.model import DisparityNet
+from mvcore.network.procedural.objects import SIZE, Target
 from mvcore.network.recognition import SHIPPED, TargetClassifier, load_classifier, rank_1, squared_error
-from mvcore.network.targets import SIZE, Target
-from mvcore.network.train_recognition import RecognitionTraining, train_recognition, validate_recognition
+from mvcore.network.training.batches import Recipe, make_batch
+from mvcore.network.training.datasets import LAYOUTS, cropped, find_items
+from mvcore.network.training.logs import plot_log
+from mvcore.network.training.train_recognition import RecognitionTraining, train_recognition, validate_recognition
 from mvcore.network.weights import save_weights
 
 SMALL = Recipe(width=96, height=64)

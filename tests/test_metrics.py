@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 import trimesh
-from mvcore import FormatError, InvalidInputError, metrics
+from mvcore import FormatError, InvalidInputError
+from mvcore.evaluation import metrics
 
 
 def square(z=0.0):

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mvcore.cameras import relative_map
 from mvcore.errors import FormatError, InvalidInputError
-from mvcore.network.batches import Recipe, make_batch
+from mvcore.geometry.cameras import relative_map
 from mvcore.network.cost import correlate, landing, scaled_maps, unit
 from mvcore.network.features import PRESETS, Trunk, load_vgg16
-from mvcore.network.losses import loss
-from mvcore.network.match import SHIPPED
+from mvcore.network.matcher import SHIPPED
 from mvcore.network.model import DisparityNet
+from mvcore.network.procedural.scenes import Tiles, random_pair, random_views
 from mvcore.network.regularise import soft_argmin, windowed_soft_argmin
-from mvcore.network.scenes import Tiles, random_pair, random_views
-from mvcore.network.train_disparity import Training, _rate, train_disparity
+from mvcore.network.training.batches import Recipe, make_batch
+from mvcore.network.training.losses import loss
+from mvcore.network.training.train_disparity import Training, _rate, train_disparity
 from mvcore.network.weights import load_disparity, save_weights
 
 SMALL = Recipe(width=64, height=48)
@@ -160,7 +160,7 @@ def test_bfloat16_leaves_the_gradients_of_the_second_stage_as_they_are():
 
 
 def test_frozen_statistics_need_weights_to_start_from(tmp_path):
-    from mvcore.cli import app
+    from mvcore.cli.main import app
     from typer.testing import CliRunner
 
     result = CliRunner().invoke(app, ["train", "disparity", "--out", str(tmp_path), "--freeze-norms"])
@@ -180,7 +180,7 @@ def test_the_rate_falls_to_zero_by_the_steps_or_by_the_hours():
 
 @pytest.mark.parametrize("size", ["320", "320x250", "16x16", "ax b"])
 def test_sizes_that_training_cannot_take_are_named(size, tmp_path):
-    from mvcore.cli import app
+    from mvcore.cli.main import app
     from typer.testing import CliRunner
 
     result = CliRunner().invoke(app, ["train", "disparity", "--out", str(tmp_path), "--size", size])

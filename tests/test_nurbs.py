@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import InvalidInputError, nurbs
 from mvcore.errors import FormatError
-from mvcore.metrics import nearest_distance
+from mvcore.evaluation.metrics import nearest_distance
 from mvcore.nurbs.fit import collocation
 
 GRID = np.linspace(0, 1, 83)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import write_scene
-from mvcore import InvalidInputError, ReconstructionError, metrics
-from mvcore.cli import app
-from mvcore.depth.hidden import continued
+from mvcore import InvalidInputError, ReconstructionError
+from mvcore.cli.main import app
+from mvcore.depth.occlusion import continued
+from mvcore.evaluation import metrics
 from typer.testing import CliRunner
 
 SETTINGS = {"texture": {"least_patch": 8}}
@@ -99,7 +100,7 @@ def test_the_same_bytes_for_one_and_two_threads(ring, tmp_path):
     outs = []
     for n, threads in enumerate(("1", "2", "2")):
         out = tmp_path / f"{n}.glb"
-        command = [sys.executable, "-m", "mvcore.cli", "reconstruct", str(folder), "-o", str(out)]
+        command = [sys.executable, "-m", "mvcore.cli.main", "reconstruct", str(folder), "-o", str(out)]
         subprocess.run(command, check=True, env={**os.environ, "RAYON_NUM_THREADS": threads}, capture_output=True)
         outs.append(out.read_bytes())
     assert outs[0] == outs[1] == outs[2]
@@ -244,7 +245,7 @@ def test_commands(ring, tmp_path):
     ],
 )
 def test_errors_are_one_line_with_exit_code_2(arguments, tmp_path):
-    command = [sys.executable, "-m", "mvcore.cli", *arguments]
+    command = [sys.executable, "-m", "mvcore.cli.main", *arguments]
     out = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert out.returncode == 2
     assert len(out.stderr.strip().splitlines()) == 1

@@ -10,31 +10,39 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import _core
 from mvcore.config import Config, DepthConfig, SurfaceConfig, VolumeConfig
-from mvcore.depth import View, estimate_depth, filter_depth, guided_depth, refine_depth, seeded_depth, sweep_depth
-from mvcore.depth.pairs import _speckles
-from mvcore.errors import InvalidInputError, ReconstructionError
-from mvcore.io.images import read_image
-from mvcore.sparse import (
-    CalibrationError,
-    calibration_error,
-    candidate_pairs,
-    check_calibration,
-    choose_sources,
-    common_volume,
-    convergence,
-    depth_ranges,
-    detect,
-    find_points,
-    fundamental,
-    match_and_triangulate,
-    surrounds,
-    target_box,
-    view_scores,
+from mvcore.depth import (
+    View,
+    estimate_depth,
+    filter_depth,
+    guided_depth,
+    refine_depth,
+    seeded_depth,
+    sweep_depth,
 )
-from mvcore.surface import Surface, cleaned, decimate, drop_small_parts, extract_surface, isosurface, marching_cubes, smooth
-from mvcore.texture import colour_gains, texture
+from mvcore.depth.stereo import _speckles
+from mvcore.errors import InvalidInputError, ReconstructionError
+from mvcore.geometry.epipolar import fundamental
+from mvcore.geometry.rig import common_volume, convergence, surrounds
+from mvcore.io.images import read_image
+from mvcore.mesh.surface import (
+    Surface,
+    cleaned,
+    decimate,
+    drop_small_parts,
+    extract_surface,
+    isosurface,
+    marching_cubes,
+    smooth,
+)
+from mvcore.mesh.texture import colour_gains, texture
+from mvcore.silhouettes.occluder_repair import repaired_masks
+from mvcore.sparse.calibration_check import CalibrationError, calibration_error, check_calibration
+from mvcore.sparse.features import candidate_pairs, detect
+from mvcore.sparse.points import find_points, match_and_triangulate
+from mvcore.sparse.view_selection import choose_sources, depth_ranges, target_box, view_scores
 from mvcore.types import DepthMap, Report, SparsePoints
-from mvcore.volume import Volume, _Fusion, fuse, fuse_tiles, hull_share, repaired_masks, silhouette_distance
+from mvcore.volume.hull_prior import hull_share, silhouette_distance
+from mvcore.volume.tsdf import Volume, _Fusion, fuse, fuse_tiles
 
 
 def test_unknown_settings_name_the_nearest():
@@ -250,8 +258,8 @@ def test_consistency_equals_its_twin():
     rng = np.random.default_rng(1)
     maps = [np.where(rng.random((18, 24)) < 0.3, 3.6, 3.0).astype(np.float32) for _ in cameras]
     maps[0][3, 4] = 0
-    there = np.stack([mvcore.cameras.relative_map(cameras[0], c) for c in cameras[1:]])
-    back = np.stack([mvcore.cameras.relative_map(c, cameras[0]) for c in cameras[1:]])
+    there = np.stack([mvcore.geometry.cameras.relative_map(cameras[0], c) for c in cameras[1:]])
+    back = np.stack([mvcore.geometry.cameras.relative_map(c, cameras[0]) for c in cameras[1:]])
     for min_views in (1, 2):
         # 20 % steps: no two taps of a bilinear sample mix, so the nearest pixel decides in both
         kept, _ = _core.consistency(maps[0], maps[1:], there, back, min_views, 0.5, 0.05)
@@ -468,7 +476,7 @@ def test_gains_bring_exposures_together():
 
 
 def test_texture_shows_the_photographs(ring):
-    from mvcore import metrics
+    from mvcore.evaluation import metrics
 
     cameras, images, _, _ = ring
     scaled = ball()
@@ -527,7 +535,7 @@ def test_disparities_have_their_edges_where_the_picture_has_them(monkeypatch):
         return float((np.abs(found - truth) > 2)[seen].mean())
 
     sharp = bad()
-    monkeypatch.setattr("mvcore.depth.pairs.MEDIAN_ROUNDS", 0)
+    monkeypatch.setattr("mvcore.depth.stereo.MEDIAN_ROUNDS", 0)
     assert sharp < 0.6 * bad()
     assert sharp < 0.03
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import look_at, texture_of
-from mvcore import _core, standing
-from mvcore.cameras import Camera
+from mvcore import _core
 from mvcore.config import Config, StandingConfig, VolumeConfig
-from mvcore.standing import Plane, find_standing, ground, widest_gap
-from mvcore.surface import Surface, drop_cavities, drop_unseen, extract_surface
+from mvcore.geometry.cameras import Camera
+from mvcore.mesh.surface import Surface, drop_cavities, drop_unseen, extract_surface
+from mvcore.silhouettes import object_segmentation as standing
+from mvcore.silhouettes.object_segmentation import Plane, find_standing, ground, widest_gap
 from mvcore.types import DepthMap, Report
-from mvcore.volume import fuse_tiles
+from mvcore.volume.tsdf import fuse_tiles
 
 BOUNDS = np.array([[-0.8, -0.8, -0.2], [0.8, 0.8, 1.0]])
 FLOOR = -0.05

@@ -20,18 +20,19 @@ from conftest import look_at, render_target, rig, turned, write_clips
 from hypothesis import given
 from hypothesis import strategies as st
 from mvcore import InvalidInputError, ReconstructionError
-from mvcore.carve import Occupancy, carve_silhouettes, shadow, visual_hull
-from mvcore.cli import app
+from mvcore.cli.main import app
 from mvcore.config import TargetConfig, VolumeConfig
+from mvcore.geometry.registration import Cloud, find_poses
 from mvcore.io import load_video
-from mvcore.motion import Cloud, find_poses
-from mvcore.sequence import animated, read_index
-from mvcore.store import Store, digest
-from mvcore.surface import isosurface
-from mvcore.target import Background, foreground, learn_backgrounds
-from mvcore.targets import Tracker, find_targets, motions, moved, on_targets
-from mvcore.video import reconstruct_video
-from mvcore.viewer import write_page
+from mvcore.mesh.surface import isosurface
+from mvcore.pipeline.store import Store, digest
+from mvcore.silhouettes.background_subtraction import Background, foreground, learn_backgrounds
+from mvcore.silhouettes.visual_hull import Occupancy, carve_silhouettes, shadow
+from mvcore.video.api import reconstruct_video
+from mvcore.video.tracking import Tracker, find_targets, motions, moved, on_targets
+from mvcore.video.writer import animated, read_index
+from mvcore.viewer.page import write_page
+from mvcore.volume.photo_hull import visual_hull
 from typer.testing import CliRunner
 
 POSES = [turned(4.0 * t, (0.05 * t, -0.03 * t, 0.02 * t)) for t in range(4)]
@@ -120,7 +121,7 @@ def test_other_processes_give_the_same_bytes(local, folder, tmp_path):
 SCRIPT = """
 import sys
 from mvcore.io import load_video
-from mvcore.video import reconstruct_video
+from mvcore.video.api import reconstruct_video
 if __name__ == "__main__":
     folder, out, settings = sys.argv[1], sys.argv[2], eval(sys.argv[3])
     reconstruct_video(load_video(folder), target="rigid", config=settings, workdir=out + "/work").save(out)
@@ -421,8 +422,8 @@ def test_a_background_is_learnt_from_the_clip():
 def test_masks_of_real_size_match_the_true_ones(shared):
     clips = load_video(shared / "synthetic" / "truck-video")
     cameras = [c.pinhole() for c in clips.calib]
+    from mvcore.geometry.rig import common_volume
     from mvcore.io.images import read_image, read_mask
-    from mvcore.sparse import common_volume
 
     backgrounds = [Background.from_plate(read_image(c.plate)) for c in clips.clips]
     images = [clips.undistorted(n, 2) for n in range(8)]

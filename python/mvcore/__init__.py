@@ -8,17 +8,21 @@ result.save("fountain.glb")
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
-from .cameras import Calibration, Camera
 from .config import Config
 from .errors import FormatError, InvalidInputError, MvcoreError, ReconstructionError
-from .types import DepthMap, Scene, SparsePoints
+from .geometry.cameras import Calibration, Camera
+from .types import DepthMap, SparsePoints
 
 if TYPE_CHECKING:
+    from . import nurbs
     from .depth import disparity
+    from .evaluation import metrics
     from .io import load, load_video, save_calibration
-    from .pipeline import reconstruct
-    from .result import Reconstruction
-    from .video import reconstruct_video
+    from .io.scene import Scene
+    from .pipeline.reconstruct import reconstruct
+    from .pipeline.result import Reconstruction
+    from .video.api import reconstruct_video
+    from .volume import carving as carve
 
 __version__ = _version("mvcore")
 
@@ -27,9 +31,10 @@ _LATER = {
     "load": "io",
     "load_video": "io",
     "save_calibration": "io",
-    "reconstruct": "pipeline",
-    "reconstruct_video": "video",
-    "Reconstruction": "result",
+    "reconstruct": "pipeline.reconstruct",
+    "reconstruct_video": "video.api",
+    "Reconstruction": "pipeline.result",
+    "Scene": "io.scene",
 }
 """Names that bring OpenCV with them: imported when they are first used."""
 
@@ -45,20 +50,29 @@ __all__ = [
     "ReconstructionError",
     "Scene",
     "SparsePoints",
+    "carve",
     "disparity",
     "load",
     "load_video",
+    "metrics",
+    "nurbs",
     "reconstruct",
     "reconstruct_video",
     "save_calibration",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LATER:
-        from importlib import import_module
+_MODULES = {"carve": "volume.carving", "metrics": "evaluation.metrics", "nurbs": "nurbs"}
+"""Modules under the names by which users know them."""
 
+
+def __getattr__(name: str) -> Any:
+    from importlib import import_module
+
+    if name in _LATER:
         return getattr(import_module(f".{_LATER[name]}", __name__), name)
+    if name in _MODULES:
+        return import_module(f".{_MODULES[name]}", __name__)
     raise AttributeError(f"module 'mvcore' has no attribute {name!r}")
 
 

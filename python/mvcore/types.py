@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-
-from .cameras import Calibration
 
 T = TypeVar("T")
 
@@ -32,23 +30,6 @@ class Track(Protocol):
 def no_track(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
     """The silent default."""
     return items
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What `mvcore.load` finds: frames with their cameras, and masks and bounds where the set has them.
-
-    ``masks[i]`` is the path of frame i's mask (or None); ``bounds`` is (2, 3) float64 or None.
-    """
-
-    frames: Sequence[Frame]
-    calib: Calibration
-    masks: Sequence[Frame | None] | None = None
-    bounds: Bounds | None = None
-    format: str = ""
-
-    def __len__(self) -> int:
-        return len(self.calib)
 
 
 @dataclass(frozen=True)

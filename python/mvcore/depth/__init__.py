@@ -6,9 +6,17 @@ planes are then refined on it and on each finer scale up to the full size. A rec
 homographies.
 """
 
-from .consistency import filter_depth
-from .pairs import disparity
-from .passes import RoughDepth, estimate_depth, guided_depth, network_depth, refine_depth, seeded_depth, sweep_depth
+from .geometric_filter import filter_depth
+from .passes import (
+    RoughDepth,
+    estimate_depth,
+    guided_depth,
+    network_depth,
+    refine_depth,
+    seeded_depth,
+    sweep_depth,
+)
+from .stereo import disparity
 from .views import View
 
 __all__ = [

@@ -9,11 +9,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Camera
 from ..config import DepthConfig
 from ..errors import require
+from ..geometry.cameras import Camera
 from ..types import DepthMap
-from .planes import MEDIAN_RADIUS, Expected, Hypotheses, aggregate, carried_to, hypotheses_from, refine, sharpened, slanted, sweep_scale
+from .planes import (
+    MEDIAN_RADIUS,
+    Expected,
+    Hypotheses,
+    aggregate,
+    carried_to,
+    hypotheses_from,
+    refine,
+    sharpened,
+    slanted,
+    sweep_scale,
+)
 from .views import Map, Scale, View, blank, guide_of, pyramid, resized_nearest, resized_smoothly
 
 
@@ -132,7 +143,7 @@ def network_depth(
 
     Parameters and errors as of `sweep_depth`; views need colours; ``device`` is ``cpu`` or ``cuda``.
     """
-    from ..network.match import shipped_matcher
+    from ..network.matcher import shipped_matcher
 
     config = config or DepthConfig()
     _check(sources, near, far)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Camera, relative_map
 from ..config import DepthConfig
+from ..geometry.cameras import Camera, relative_map
 
 Grey = NDArray[np.uint8]
 

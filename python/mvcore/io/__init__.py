@@ -1,7 +1,7 @@
 """Reading and writing: camera formats, images, masks, meshes' companions."""
 
 from .clips import Clips, load_video
-from .detect import load
-from .write import save_calibration
+from .formats.detect import load
+from .formats.write import save_calibration
 
 __all__ = ["Clips", "load", "load_video", "save_calibration"]

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Calibration, Camera
 from ..errors import FormatError, InvalidInputError, require
+from ..geometry.cameras import Calibration, Camera
 from ..types import Image
-from .detect import load
+from .formats.detect import load
+from .formats.records import image_size
 from .images import read_image, undistort
 from .media import VIDEO_SUFFIXES, frame_files, natural_order, plate_in, probe, video_frame
-from .records import image_size
 
 Source = str | Path | Sequence[str | Path] | NDArray[np.uint8]
 """A video file, a folder of images, their paths in order, or an array (frames, h, w, 3)."""

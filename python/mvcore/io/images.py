@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Camera
 from ..errors import FormatError, InvalidInputError, require
+from ..geometry.cameras import Camera
 from ..types import Frame, Image
-from .records import IMAGE_SUFFIXES, find_mask
+from .formats.records import IMAGE_SUFFIXES, find_mask
 
 
 def read_image(path: str | Path) -> Image:

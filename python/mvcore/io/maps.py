@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError, require
-from ..files import atomically
+from .files import atomically
 
 Map = NDArray[np.float32]
 

@@ -12,7 +12,7 @@ import cv2
 
 from ..errors import FormatError
 from ..types import Image
-from .records import IMAGE_SUFFIXES, image_size
+from .formats.records import IMAGE_SUFFIXES, image_size
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 PLATES = ("background", "clean", "plate", "empty")

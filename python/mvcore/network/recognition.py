@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from ..errors import require
 from .features import PRESETS, LocalBlock, Trunk, normalised
-from .targets import SIZE
+from .procedural.objects import SIZE
 from .weights import load_into, notes_of
 
 EMBEDDING = 1024

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ..errors import FormatError
-from ..files import atomically
+from ..io.files import atomically
 from .model import DisparityNet
 
 

@@ -4,7 +4,7 @@
 """
 
 from .curve import Curve
-from .export import load_obj, save_obj, save_step, tessellate, to_mesh
+from .export import tessellate, to_mesh
 from .fit import (
     approximate_curve,
     approximate_surface,
@@ -13,9 +13,11 @@ from .fit import (
     interpolate_surface,
     spread_parameters,
 )
+from .fit_mesh import TargetFit, fit_target
+from .obj import load_obj, save_obj
 from .shapes import arc, circle, cylinder, ellipse, extrude, loft, revolve, ruled, sphere, torus
+from .step import save_step
 from .surface import Surface
-from .target import TargetFit, fit_target
 
 __all__ = [
     "Curve",

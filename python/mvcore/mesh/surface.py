@@ -1,0 +1,220 @@
+"""From the field to a clean mesh: Marching Cubes, small parts, smoothing, decimation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import _core
+from ..config import SurfaceConfig
+from ..errors import ReconstructionError, require
+from ..geometry.cameras import Camera
+from ..volume.tsdf import SIDE, Volume
+
+Float = NDArray[np.float64]
+Faces = NDArray[np.uint32]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """vertices : (V, 3) float64, world. faces : (F, 3) uint32, counter-clockwise from outside."""
+
+    vertices: Float
+    faces: Faces
+
+
+def marching_cubes(values: NDArray[np.float32], level: float = 0.0) -> tuple[NDArray[np.float32], Faces]:
+    """Isosurface of a dense volume.
+
+    Parameters
+    ----------
+    values : (nx, ny, nz) float32, C order; below ``level`` is inside, NaN is unknown.
+
+    Returns
+    -------
+    vertices : (V, 3) float32 in sample coordinates. faces : (F, 3) uint32, counter-clockwise from outside.
+
+    Examples
+    --------
+    >>> x, y, z = np.mgrid[-9:10, -9:10, -9:10].astype(np.float32)
+    >>> vertices, faces = marching_cubes(np.sqrt(x**2 + y**2 + z**2) - 6.3)
+    >>> len(vertices) - len(faces) // 2
+    2
+    """
+    values = np.asarray(values)
+    require(values.ndim == 3, "values", "shape (nx, ny, nz)", values.shape)
+    shifted = np.ascontiguousarray(values if level == 0 else values - np.float32(level), np.float32)
+    return _core.isosurface_dense(shifted)
+
+
+def isosurface(volume: Volume | Iterable[Volume]) -> Surface:
+    """The surface of a block-sparse field in world coordinates; parts of one (`mvcore.volume.tsdf.fuse_tiles`) are joined.
+
+    Vertices on a layer that two parts share are equal to the bit in both, and become one.
+    """
+    points, faces, count = [], [], 0
+    grid: Volume | None = None
+    for part in [volume] if isinstance(volume, Volume) else volume:
+        grid = part
+        p, f = _core.isosurface_sparse(part.coords, part.values)
+        points.append(p)
+        faces.append(f + np.uint32(count))
+        count += len(p)
+    require(grid is not None, "volume", "one part or more", "none")
+    assert grid is not None
+    vertices, triangles = np.concatenate(points), np.concatenate(faces)
+    if len(points) > 1:
+        vertices, triangles = _joined(vertices, triangles)
+    return Surface(grid.origin + grid.voxel * vertices.astype(np.float64), triangles)
+
+
+def _joined(vertices: NDArray[np.float32], faces: Faces) -> tuple[NDArray[np.float32], Faces]:
+    """One vertex where parts have one each: vertices of a single part never coincide."""
+    shared = np.flatnonzero((vertices % SIDE == 0).any(1))
+    rows = np.ascontiguousarray(vertices[shared]).view(np.dtype((np.void, 12))).ravel()
+    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
+    owner = np.arange(len(vertices), dtype=np.uint32)
+    owner[shared] = shared[first[number]]
+    return _used(vertices, owner[faces])
+
+
+def extract_surface(volume: Volume | Iterable[Volume], config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
+    """Isosurface of a field or its parts, then `cleaned`.
+
+    Raises
+    ------
+    ReconstructionError
+        The field has no surface.
+    """
+    return cleaned(isosurface(volume), config, solid)
+
+
+def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
+    """Small parts dropped and small holes closed, then smoothed and decimated as configured.
+
+    ``solid`` says that the surface is closed (silhouettes were given): bubbles inside it are dropped too. Errors as of `extract_surface`.
+    """
+    config = config or SurfaceConfig()
+    if not len(surface.faces):
+        raise ReconstructionError("the depth maps agree on no surface inside the bounds")
+    if solid:
+        surface = drop_cavities(surface)
+    surface = drop_small_parts(surface, config.min_component)
+    surface = close_holes(surface, config.close_holes)
+    if config.smooth:
+        surface = smooth(surface, config.smooth)
+    if config.max_faces is not None and len(surface.faces) > config.max_faces:
+        surface = decimate(surface, config.max_faces)
+    return surface
+
+
+def compact(vertices: Float, faces: Faces) -> Surface:
+    """A surface of these faces alone, without the vertices that none of them has."""
+    return Surface(*_used(vertices, faces))
+
+
+def _used(vertices: NDArray[Any], faces: Faces) -> tuple[NDArray[Any], Faces]:
+    """The vertices that faces have, and the faces with their new numbers."""
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.uint32) - 1
+    return vertices[used], number[faces].astype(np.uint32)
+
+
+def drop_small_parts(surface: Surface, share: float) -> Surface:
+    """Drops connected parts with fewer than ``share`` times the faces of the largest."""
+    if share <= 0 or not len(surface.faces):
+        return surface
+    part = _core.components(surface.faces)
+    size = np.bincount(part)
+    return compact(surface.vertices, surface.faces[size[part] >= share * size.max()])
+
+
+def close_holes(surface: Surface, most_edges: int) -> Surface:
+    """Closes the holes of at most ``most_edges`` edges (1000 or fewer) by the least area, where the patch lies in the surface."""
+    if most_edges < 3 or not len(surface.faces):
+        return surface
+    return Surface(surface.vertices, np.concatenate([surface.faces, _core.close_holes(surface.vertices, surface.faces, most_edges)]))
+
+
+def drop_cavities(surface: Surface) -> Surface:
+    """Drops closed parts that face inward (their signed volume is negative): no photograph sees into a bubble."""
+    part = _core.components(surface.faces)
+    a, b, c = (surface.vertices[surface.faces[:, k]] - surface.vertices.mean(0) for k in range(3))
+    inward = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c))) <= 0
+    some = np.nonzero(inward[part])[0]
+    # An open part has no inside.
+    inward[part[some[_at_border(surface.faces[some])]]] = False
+    return compact(surface.vertices, surface.faces[~inward[part]])
+
+
+def _at_border(faces: Faces) -> NDArray[np.bool_]:
+    """Faces with an edge that no other face has, (f,) bool."""
+    wide = faces.astype(np.int64)
+    ends = np.sort(np.stack([wide, np.roll(wide, -1, 1)], -1).reshape(-1, 2), 1)
+    _, first, count = np.unique(ends[:, 0] << 32 | ends[:, 1], return_index=True, return_counts=True)
+    border = np.zeros(len(faces), bool)
+    border[first[count == 1] // 3] = True
+    return border
+
+
+def drop_unseen(surface: Surface, cameras: Sequence[Camera], voxel: float, reach: float) -> Surface:
+    """Drops faces that no camera sees and that lie farther than ``reach`` voxels from all that one sees.
+
+    Where silhouettes bound a surface, nothing else says where it runs on the sides that no photograph shows. All of it stays if nothing
+    is seen at all.
+
+    Parameters
+    ----------
+    voxel : scale of the surface's detail, world units.
+    reach : voxels; never less than one and a half pixel footprints, for faces finer than pixels lie between their rays.
+    """
+    seen = np.zeros(len(surface.vertices), bool)
+    least = 0.0
+    for camera in cameras:
+        depth, face = _core.rasterize(surface.vertices, surface.faces, camera.projection, camera.width, camera.height)
+        hit = face >= 0
+        if hit.any():
+            seen[surface.faces[face[hit]]] = True
+            least = max(least, float(np.median(depth[hit])) / camera.K[0, 0])
+    if not seen.any() or seen.all():
+        return surface
+    within = max(reach * voxel, 1.5 * least)
+    distance, _ = _core.nearest(surface.vertices[~seen], surface.vertices[seen], within)
+    seen[~seen] = np.isfinite(distance)
+    return compact(surface.vertices, surface.faces[seen[surface.faces].any(1)])
+
+
+def smooth(surface: Surface, rounds: int) -> Surface:
+    """Taubin smoothing (λ 0.5, μ -0.53): noise goes, volume stays."""
+    v, f = surface.vertices.copy(), surface.faces.astype(np.int64)
+    edges = np.unique(np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), 1), axis=0)
+    degree = np.bincount(edges.ravel(), minlength=len(v))[:, None].clip(1)
+    for _ in range(rounds):
+        for step in (0.5, -0.53):
+            mean = np.stack(
+                [
+                    np.bincount(edges[:, 0], v[edges[:, 1], k], len(v)) + np.bincount(edges[:, 1], v[edges[:, 0], k], len(v))
+                    for k in range(3)
+                ],
+                1,
+            )
+            v += step * (mean / degree - v)
+    return Surface(v, surface.faces)
+
+
+def decimate(surface: Surface, max_faces: int) -> Surface:
+    """Quadric-error decimation to about ``max_faces`` faces (fast-simplification)."""
+    import fast_simplification
+
+    require(max_faces >= 4, "max_faces", "at least 4", max_faces)
+    # The library works in float32: centred and scaled, nothing of the position is lost.
+    center = surface.vertices.mean(0)
+    scale = np.abs(surface.vertices - center).max()
+    points = ((surface.vertices - center) / scale).astype(np.float32)
+    v, f = fast_simplification.simplify(points, surface.faces.astype(np.int32), target_count=max_faces)
+    return compact(v.astype(np.float64) * scale + center, f.astype(np.uint32))

@@ -1,0 +1,1 @@
+"""Procedural scenes with exact truth, on which the network is trained."""

@@ -1,0 +1,1 @@
+"""Silhouettes: found in images, and the visual hull they bound."""

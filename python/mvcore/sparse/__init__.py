@@ -1,0 +1,1 @@
+"""Sparse points: where to search, and whether the calibration fits."""

@@ -1,0 +1,150 @@
+"""A reconstructed clip on disk: a folder of GLB files, pictures of the depth maps and a JSON index."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..io.files import atomically
+from ..io.maps import colourise
+from ..pipeline.result import Reconstruction
+
+INDEX = "index.json"
+PICTURE = 480
+"""Pixels of the longer side of depth pictures."""
+_TIMED = ("seconds", "peak_memory_mib")
+"""What differs from run to run stays out of the files: equal input gives equal bytes."""
+
+
+class SequenceWriter:
+    """Writes a clip's reconstructions as they come; the index is written last, so a folder with one is complete."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / INDEX).unlink(missing_ok=True)
+        self.instants: list[dict[str, Any]] = []
+
+    def add(self, result: Reconstruction, parts: Sequence[Reconstruction], names: Sequence[str]) -> None:
+        """One instant: ``parts`` are its targets, one or more; ``names`` those of the cameras."""
+        number = int(result.report["instant"])
+        files = []
+        for part in parts if len(result.faces) else ():
+            target = int(part.report.get("target", 0))
+            # A target keeps its number through the clip; a clip of one target does not bother anybody with it.
+            name = f"instant{number:04d}.glb" if len(parts) == 1 and target == 0 else f"instant{number:04d}_target{target}.glb"
+            part.save(self.folder / name)
+            files.append(name)
+        pictures = {}
+        for name, view in zip(names, result.depths, strict=True):
+            if view is not None:
+                pictures[name] = f"depth/instant{number:04d}_{name}.jpg"
+                _save_picture(self.folder / pictures[name], view.depth)
+        report = {k: v for k, v in result.report.items() if k not in _TIMED}
+        entry = {"instant": number, "time": report.get("time"), "files": files, "depth": pictures}
+        self.instants.append(entry | {"bounds": np.asarray(result.bounds).tolist(), "report": report})
+
+    def finish(self, warnings: Sequence[str], model: Reconstruction | None, trajectory: NDArray[np.float64] | None) -> None:
+        """The model of a rigid target, still and animated, and the index."""
+        index: dict[str, Any] = {"format": "mvcore sequence", "version": 1, "warnings": list(warnings), "instants": self.instants}
+        if model is not None and trajectory is not None:
+            model.save(self.folder / "model.glb")
+            seen = [n for n, pose in enumerate(trajectory) if np.isfinite(pose).all()]
+            times = np.array([self.instants[n]["time"] for n in seen], np.float64)
+            data = animated((self.folder / "model.glb").read_bytes(), times, trajectory[seen])
+            atomically(self.folder / "animated.glb", lambda p: p.write_bytes(data) and None)
+            poses = [pose.tolist() if np.isfinite(pose).all() else None for pose in trajectory]
+            report = {k: v for k, v in model.report.items() if k not in _TIMED}
+            index["rigid"] = {"model": "model.glb", "animated": "animated.glb", "poses": poses, "report": report}
+        text = json.dumps(index, indent=1, sort_keys=True) + "\n"
+        atomically(self.folder / INDEX, lambda p: p.write_text(text, encoding="utf-8") and None)
+
+
+def read_index(folder: str | Path) -> dict[str, Any]:
+    """The index of a finished folder.
+
+    Raises
+    ------
+    FileNotFoundError, FormatError
+        No index (no run, or one that was interrupted), or another file.
+    """
+    path = Path(folder) / INDEX
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such index; is this the output of a finished 'mvcore video'?")
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise FormatError(f"{path}: {error}") from None
+    if not isinstance(index, dict) or index.get("format") != "mvcore sequence":
+        raise FormatError(f"{path}: not the index of a sequence")
+    return index
+
+
+def _save_picture(path: Path, depth: NDArray[np.float32]) -> None:
+    picture = colourise(depth)
+    scale = PICTURE / max(picture.shape[:2])
+    if scale < 1:
+        picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    if not done:
+        raise OSError(f"{path}: the picture cannot be encoded")
+    atomically(path, lambda p: p.write_bytes(data.tobytes()) and None)
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(x, y, z, w) of a rotation matrix."""
+    vector = cv2.Rodrigues(np.ascontiguousarray(rotation))[0].ravel()
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 0 else np.zeros(3)
+    return np.append(axis * np.sin(angle / 2), np.cos(angle / 2))
+
+
+def animated(glb: bytes, times: NDArray[np.float64], poses: NDArray[np.float64]) -> bytes:
+    """A GLB whose scene moves along ``poses`` (T, 4, 4) at ``times`` (T,) seconds, as a glTF 2.0 animation.
+
+    Raises
+    ------
+    FormatError
+        Not a binary glTF file.
+    """
+    magic, version, _ = struct.unpack_from("<4sII", glb)
+    if magic != b"glTF" or version != 2:
+        raise FormatError("glb: expected a binary glTF 2.0 file")
+    size, _ = struct.unpack_from("<I4s", glb, 12)
+    tree = json.loads(glb[20 : 20 + size])
+    body = glb[20 + size + 8 :]
+    body += b"\0" * (-len(body) % 4)
+    turns = np.stack([_quaternion(p[:3, :3]) for p in poses])
+    for k in range(1, len(turns)):  # the short way round
+        if turns[k] @ turns[k - 1] < 0:
+            turns[k] = -turns[k]
+    accessors = []
+    for values, kind in ((times - times[0], "SCALAR"), (poses[:, :3, 3], "VEC3"), (turns, "VEC4")):
+        data = np.ascontiguousarray(values, "<f4")
+        tree.setdefault("bufferViews", []).append({"buffer": 0, "byteOffset": len(body), "byteLength": data.nbytes})
+        accessor = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": 5126, "count": len(data), "type": kind}
+        if kind == "SCALAR":  # the standard asks for the range of times
+            accessor |= {"min": [float(data.min())], "max": [float(data.max())]}
+        tree.setdefault("accessors", []).append(accessor)
+        accessors.append(len(tree["accessors"]) - 1)
+        body += data.tobytes()
+    scene = tree["scenes"][tree.get("scene", 0)]
+    tree["nodes"].append({"name": "target", "children": scene["nodes"]})
+    node = len(tree["nodes"]) - 1
+    scene["nodes"] = [node]
+    samplers = [{"input": accessors[0], "output": a, "interpolation": "LINEAR"} for a in accessors[1:]]
+    channels = [{"sampler": n, "target": {"node": node, "path": path}} for n, path in enumerate(("translation", "rotation"))]
+    tree["animations"] = [{"name": "trajectory", "samplers": samplers, "channels": channels}]
+    tree["buffers"][0]["byteLength"] = len(body)
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body))
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body

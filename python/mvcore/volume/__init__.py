@@ -1,0 +1,1 @@
+"""Fusion of depth maps into a signed distance field."""

@@ -1,0 +1,65 @@
+"""Signed distance to silhouettes, and how much the visual hull counts against depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.cameras import Camera
+from ..silhouettes.occluder_repair import _pixels
+from ..types import DepthMap
+
+
+def silhouette_distance(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Signed distance to a mask's border in pixels, positive outside, (h, w) float32."""
+    inside = (mask > 0).astype(np.uint8)
+    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
+
+
+def _open_share(depths: Sequence[DepthMap], masks: Sequence[NDArray[np.uint8]]) -> float:
+    """Share of the masks' pixels without depth, the mean of the views that show anything."""
+    shares = [float((d.depth[m > 0] == 0).mean()) for d, m in zip(depths, masks, strict=True) if m.any()]
+    return float(np.mean(shares)) if shares else 1.0
+
+
+ON_HULL = 0.01
+"""Times a target's extent: distance from the visual hull within which a point lies on it."""
+
+
+HULL_POINTS = 2000
+"""Points a view, about, by which that is judged."""
+
+
+def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.float32]]) -> float:
+    """Share of the measured surface that is the visual hull's, 1 where nothing was measured: much of a ball, little of a pickup's bed.
+
+    What the hull says where nothing was measured is as trustworthy as that. Points count by their squared confidence: where little is
+    measured, much of it is wrong.
+
+    Parameters
+    ----------
+    depths : filtered, one a camera. silhouettes : of `silhouette_distance`, one a camera.
+    """
+    clouds, weights = [], []
+    for view, camera, outside in zip(depths, cameras, silhouettes, strict=True):
+        y, x = np.nonzero((view.depth > 0) & (outside < 0))
+        step = max(1, len(x) // HULL_POINTS)
+        x, y = x[::step], y[::step]
+        clouds.append(camera.unproject(np.column_stack([x, y]), view.depth[y, x]))
+        weights.append(np.square(view.confidence[y, x], dtype=np.float64))
+    points, weight = np.concatenate(clouds), np.concatenate(weights)
+    if not weight.sum():
+        return 1.0
+    # A point lies as deep within the hull as within the outline to which it is nearest.
+    depth_in_hull = np.full(len(points), -np.inf)
+    for camera, outside in zip(cameras, silhouettes, strict=True):
+        seen, x, y = _pixels(camera, points)
+        z = camera.to_camera(points[seen])[:, 2]
+        depth_in_hull[seen] = np.maximum(depth_in_hull[seen], outside[y, x] * z / camera.K[0, 0])
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)
+    return float(weight[np.abs(depth_in_hull) < ON_HULL * np.linalg.norm(high - low)].sum() / weight.sum())

@@ -1,0 +1,260 @@
+"""Fusion of depth maps and silhouettes into a block-sparse signed distance field (paper eqs 39-41, for any pose)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import _core
+from ..config import VolumeConfig
+from ..errors import ReconstructionError, require
+from ..geometry.cameras import Camera
+from ..silhouettes.occluder_repair import repaired_masks
+from ..types import Bounds, DepthMap, Report
+from .hull_prior import _open_share, hull_share, silhouette_distance
+
+Window = tuple[float, float, float, float]
+"""x0, y0, x1, y1 in pixels of an image that may be a part of what the camera saw."""
+SIDE = 8
+"""Voxels along a block's side."""
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A truncated signed distance field in blocks of 8 x 8 x 8 voxels.
+
+    origin : (3,) world position of sample (0, 0, 0). voxel : sample distance, world units. shape : samples along x, y, z.
+    coords : (B, 3) uint32, ascending block coordinates. values : (B, 8, 8, 8) float32, distance over truncation, negative
+    inside, NaN unobserved.
+    """
+
+    origin: NDArray[np.float64]
+    voxel: float
+    shape: tuple[int, int, int]
+    coords: NDArray[np.uint32]
+    values: NDArray[np.float32]
+
+    @property
+    def blocks(self) -> tuple[int, int, int]:
+        """Blocks along x, y, z."""
+        nx, ny, nz = (-(-n // SIDE) for n in self.shape)
+        return nx, ny, nz
+
+
+def target_voxel(cameras: Sequence[Camera], depths: Sequence[DepthMap], bounds: Bounds, config: VolumeConfig) -> float:
+    """Voxel size in world units: ``config.footprints`` median pixel footprints (depth over focal length) inside the bounds."""
+    if config.voxel is not None:
+        require(config.voxel > 0, "voxel", "a positive size", config.voxel)
+        return config.voxel
+    footprints = []
+    for camera, view in zip(cameras, depths, strict=True):
+        y, x = np.nonzero(view.depth[::4, ::4])
+        z = view.depth[::4, ::4][y, x]
+        points = camera.unproject(np.column_stack([4 * x, 4 * y]), z)
+        inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
+        footprints.append(z[inside] / camera.K[0, 0])
+    every = np.concatenate(footprints)
+    if not len(every):  # silhouettes alone: the box's middle stands for the target
+        middle = bounds.mean(0)[None]
+        every = np.array([c.to_camera(middle)[0, 2] / c.K[0, 0] for c in cameras])
+        every = every[every > 0]
+    require(len(every), "bounds", "a box in front of the cameras", bounds.tolist())
+    return config.footprints * float(np.median(every))
+
+
+@dataclass(frozen=True)
+class _Fusion:
+    """What `_core.fuse` takes, checked and converted."""
+
+    depths: list[NDArray[np.float32]]
+    weights: list[NDArray[np.float32]]
+    silhouettes: list[NDArray[np.float32]] | None
+    windows: list[Window]
+    complete: bool
+    solid_weight: float
+    projections: NDArray[np.float64]
+    bounds: Bounds
+    config: VolumeConfig
+    voxel: float
+
+    @classmethod
+    def of(
+        cls,
+        depths: Sequence[DepthMap],
+        cameras: Sequence[Camera],
+        bounds: Bounds,
+        masks: Sequence[NDArray[np.uint8]] | None,
+        config: VolumeConfig,
+        windows: Sequence[Window] | None,
+        found: Sequence[NDArray[np.uint8]] | None,
+    ) -> _Fusion:
+        bounds = np.asarray(bounds, np.float64)
+        outlines = found if masks is None else repaired_masks(depths, cameras, masks)
+        silhouettes = None if outlines is None else [silhouette_distance(m) for m in outlines]
+        solid_weight = 0.0
+        if outlines is not None and silhouettes is not None:
+            open_share = _open_share(depths, outlines)
+            # Little that was measured says little against the hull.
+            trust = 1 - (1 - open_share) * (1 - hull_share(depths, cameras, silhouettes))
+            solid_weight = config.solid_share * trust**2 * open_share * len(depths)
+        return cls(
+            [d.depth for d in depths],
+            [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
+            silhouettes,
+            list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
+            masks is None and found is not None,
+            solid_weight,
+            np.stack([c.projection for c in cameras]),
+            bounds,
+            config,
+            target_voxel(cameras, depths, bounds, config),
+        )
+
+    def grid(self, voxel: float) -> Volume:
+        """An empty volume of this voxel size around the bounds."""
+        nx, ny, nz = (int(n) for n in np.ceil((self.bounds[1] - self.bounds[0]) / voxel) + 5)
+        nothing = np.zeros((0, 3), np.uint32), np.zeros((0, SIDE, SIDE, SIDE), np.float32)
+        return Volume(self.bounds[0] - 2 * voxel, voxel, (nx, ny, nz), *nothing)
+
+    def run(self, grid: Volume, tile: list[list[int]] | None = None, hollow: bool = False) -> Volume:
+        """The field, or the blocks from tile[0] up to tile[1]; MemoryError beyond ``max_memory``.
+
+        ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes.
+        """
+        config = self.config
+        coords, values = _core.fuse(
+            grid.origin.tolist(),
+            grid.voxel,
+            list(grid.shape),
+            self.depths,
+            self.weights,
+            self.silhouettes,
+            self.windows,
+            self.projections,
+            tile=tile,
+            truncation=config.truncation * grid.voxel,
+            free_weight=config.free_weight,
+            min_weight=config.min_weight,
+            solid_weight=self.solid_weight,
+            smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
+            measured_smoothing=config.smoothing,
+            hull_tolerance=config.hull_tolerance,
+            complete=self.complete,
+            hollow=hollow,
+            max_memory=config.max_memory,
+        )
+        return replace(grid, coords=coords, values=values)
+
+    def tiles(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
+        """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
+        # A block more on every side for the smoothing, and one at the far side, of which the last cells take their samples.
+        wide = [np.maximum(low - 1, 0).tolist(), np.minimum(high + 2, grid.blocks).tolist()]
+        try:
+            found = self.run(grid, wide, hollow=True)
+        except MemoryError as error:
+            axis = int((high - low).argmax())
+            if high[axis] - low[axis] < 2:
+                raise ReconstructionError(f"max_memory = {self.config.max_memory} bytes is too little for a volume: {error}") from None
+            middle = (low[axis] + high[axis]) // 2
+            yield from self.tiles(grid, low, np.where(np.arange(3) == axis, middle, high))
+            yield from self.tiles(grid, np.where(np.arange(3) == axis, middle, low), high)
+            return
+        kept = ((found.coords >= low) & (found.coords <= high)).all(1)
+        coords, values = found.coords[kept], found.values[kept]
+        for axis in range(3):
+            seam = coords[:, axis] == high[axis]
+            np.moveaxis(values, axis + 1, 1)[seam, 1:] = np.nan
+        yield replace(grid, coords=coords, values=values)
+
+
+def fuse(
+    depths: Sequence[DepthMap],
+    cameras: Sequence[Camera],
+    bounds: Bounds,
+    masks: Sequence[NDArray[np.uint8]] | None = None,
+    config: VolumeConfig | None = None,
+    report: Report | None = None,
+    windows: Sequence[Window] | None = None,
+) -> Volume:
+    """Fuse depth maps inside ``bounds``; with masks the field is carved to the visual hull and closed inside it.
+
+    The whole field is one volume: beyond ``config.max_memory`` its voxels grow. `fuse_tiles` keeps them.
+
+    Parameters
+    ----------
+    depths : one a camera, of the camera's size; weights are confidence times (target distance / z)⁴, as σz grows with z².
+    bounds : (2, 3) world.
+    masks : (h, w) uint8, non-zero on the target.
+    windows : what each camera saw, of which its masks may be a part cut out; by default the masks' own size.
+
+    Raises
+    ------
+    ReconstructionError
+        Nothing lies inside the bounds.
+    """
+    config, report = config or VolumeConfig(), report or Report()
+    job = _Fusion.of(depths, cameras, bounds, masks, config, windows, None)
+    voxel = job.voxel
+    while True:
+        try:
+            volume = job.run(job.grid(voxel))
+            break
+        except MemoryError:
+            voxel *= 1.2
+    if voxel > job.voxel:
+        report.warn(f"voxels grew from {job.voxel:.4g} to {voxel:.4g} to stay within max_memory = {config.max_memory} bytes")
+    _say(volume, [(len(volume.coords), volume.values.nbytes)] if len(volume.coords) else [], report)
+    return volume
+
+
+def fuse_tiles(
+    depths: Sequence[DepthMap],
+    cameras: Sequence[Camera],
+    bounds: Bounds,
+    masks: Sequence[NDArray[np.uint8]] | None = None,
+    config: VolumeConfig | None = None,
+    report: Report | None = None,
+    windows: Sequence[Window] | None = None,
+    found: Sequence[NDArray[np.uint8]] | None = None,
+) -> Iterator[Volume]:
+    """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out. Blocks deep
+    inside the masks' hull are left out.
+
+    Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone: `mvcore.mesh.surface.isosurface`
+    joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
+
+    found : silhouettes that were found in the photographs, instead of masks: their hull stands in where no depth map reaches, and cuts
+        nothing.
+    """
+    config, report = config or VolumeConfig(), report or Report()
+    job = _Fusion.of(depths, cameras, bounds, masks, config, windows, found)
+    grid = job.grid(job.voxel)
+
+    def told() -> Iterator[Volume]:
+        parts = []
+        for part in job.tiles(grid, np.zeros(3, np.int64), np.array(grid.blocks)):
+            if len(part.coords):
+                parts.append((len(part.coords), part.values.nbytes))
+                yield part
+        _say(grid, parts, report)
+
+    return told()
+
+
+def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
+    if not parts:
+        raise ReconstructionError("no surface lies inside the bounds: check the bounds, the masks and the depth maps")
+    blocks, most = sum(p[0] for p in parts), max(p[1] for p in parts)
+    report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
+
+
+def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
+    distance = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), 1e-9)
+    # No depth is a distance of zero here: its weight is never asked for.
+    nearer = np.clip(np.float32(distance) / np.maximum(view.depth, np.float32(1e-6 * distance)), 0.1, 2.0)
+    np.square(nearer, out=nearer)
+    np.square(nearer, out=nearer)
+    return np.multiply(nearer, view.confidence, out=nearer)
