@@ -24,12 +24,13 @@ from mvcore.cli.main import app
 from mvcore.config import TargetConfig, VolumeConfig
 from mvcore.geometry.registration import Cloud, find_poses
 from mvcore.io import load_video
+from mvcore.mesh.hull_parts import find_targets, motions, moved, on_targets
 from mvcore.mesh.surface import isosurface
 from mvcore.pipeline.store import Store, digest
 from mvcore.silhouettes.background_subtraction import Background, foreground, learn_backgrounds
 from mvcore.silhouettes.visual_hull import Occupancy, carve_silhouettes, shadow
 from mvcore.video.api import reconstruct_video
-from mvcore.video.tracking import Tracker, find_targets, motions, moved, on_targets
+from mvcore.video.tracking import Tracker
 from mvcore.video.writer import animated, read_index
 from mvcore.viewer.page import write_page
 from mvcore.volume.photo_hull import visual_hull

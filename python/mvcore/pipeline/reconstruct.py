@@ -1,42 +1,34 @@
-"""The stages in order, and nothing else."""
+"""Calibrated images in, a textured mesh out: one frame of the task graph."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import depth as depth_stage
 from ..config import Config
 from ..errors import require
 from ..geometry.cameras import Calibration, Camera
+from ..geometry.local_frame import LocalFrame
 from ..io import load
-from ..io.images import find_masks, load_frame, load_mask, reduce, undistort
-from ..types import Bounds, DepthMap, Frame, Image, Report, Track, no_track
-from .report import _Clock, _peak_memory, _say_completed, _say_kept
+from ..io.images import find_masks
+from ..io.scene import Scene
+from ..types import Bounds, Frame, SparsePoints, Track, no_track
+from .graph import FrameTasks, Inputs, Run, Views, cropped, frame_tasks, located, overview, planned, reduced_cameras, run_frame, surveyed
+from .report import assembled
 from .result import Reconstruction
-from .stages import (
-    Draft,
-    Masks,
-    Plan,
-    Views,
-    _isosurface,
-    _standing,
-    filter_views,
-    finish,
-    first_pass,
-    make_draft,
-    make_plan,
-    second_pass,
-    third_pass,
-)
+from .session import Workdir, memory_settings, open_session, stored_depths
+from .sources import mask_sources, photographs
+from .stages import Findings, Plan, Survey, no_points
 
 
-def _calibration(calib: Calibration | Sequence[Camera] | str | Path) -> Calibration:
+def as_calibration(calib: Calibration | Sequence[Camera] | str | Path) -> Calibration:
+    """Cameras, or a path that `mvcore.load` reads, as a calibration."""
     if isinstance(calib, str | Path):
         return load(calib, images=False).calib
     return calib if isinstance(calib, Calibration) else Calibration(tuple(calib))
@@ -53,40 +45,33 @@ def check_bounds(bounds: ArrayLike | None) -> Bounds | None:
     return box
 
 
-def _inputs(
-    frames: Sequence[Frame], calib: Calibration, masks: Sequence[Frame] | None, limit: int, track: Track
-) -> tuple[list[Image], Masks | None, list[Camera]]:
-    """Undistorted images and masks, reduced alike, with their cameras."""
-    images, kept, cameras = [], [], []
-    for n, (frame, camera) in enumerate(zip(track(frames, "images", len(frames)), calib, strict=True)):
-        image, reduced = reduce(undistort(load_frame(frame, camera, n), camera), camera.pinhole(), limit)
-        images.append(image)
-        cameras.append(reduced)
-        if masks is not None:
-            mask = undistort(load_mask(masks[n], camera, n), camera, nearest=True)
-            kept.append(reduce(mask, camera.pinhole(), limit, nearest=True)[0])
-    return images, kept if masks is not None else None, cameras
-
-
 def reconstruct(
-    frames: Sequence[Frame],
-    calib: Calibration | Sequence[Camera] | str | Path,
+    frames: Sequence[Frame] | Scene,
+    calib: Calibration | Sequence[Camera] | str | Path | None = None,
     *,
-    masks: Sequence[Frame] | str | Path | None = None,
+    masks: Sequence[Frame | None] | str | Path | None = None,
     bounds: ArrayLike | None = None,
     config: Config | Mapping[str, Any] | None = None,
     track: Track | None = None,
+    workdir: str | Path | None = None,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    max_memory: int | None = None,
 ) -> Reconstruction:
-    """Calibrated photographs in, a textured mesh out.
+    """Calibrated images in, a textured mesh out.
 
     Parameters
     ----------
-    frames : (h, w, 3) uint8 RGB arrays or image paths, one a camera.
+    frames : (h, w, 3) uint8 RGB arrays or image paths, one a camera; or a scene of `mvcore.load`, whose masks and bounds are used.
     calib : cameras in the frames' order, or a path that `mvcore.load` reads.
     masks : (h, w) uint8 or bool, or paths, or a folder; non-zero on the target. Carves the mesh to the visual hull.
     bounds : ((x0, y0, z0), (x1, y1, z1)) of the target in the world; wins over what the images suggest.
     config : settings, or a mapping of them.
     track : wraps the iterables of long stages, to show progress.
+    workdir : folder that keeps results by content; the same call goes on there after an interruption. By default a temporary one.
+    executor : where the work runs, any `concurrent.futures` executor; by default threads of this process.
+    scheduler : address of a dask.distributed scheduler instead, ``tcp://host:port``; all its workers must see ``workdir``.
+    max_memory : bytes that the process may take beyond what it takes idle.
 
     Returns
     -------
@@ -99,67 +84,90 @@ def reconstruct(
         Frames, cameras, masks or settings do not fit their contracts.
     ReconstructionError
         The calibration does not fit the images, or no surface is found.
+
+    Examples
+    --------
+    >>> scene = mvcore.load("fountain/")  # doctest: +SKIP
+    >>> mvcore.reconstruct(scene).save("fountain.glb")  # doctest: +SKIP
     """
     config = config if isinstance(config, Config) else Config.from_dict(config or {})
-    track = track or no_track
-    calib = _calibration(calib)
+    if isinstance(frames, Scene):
+        require(calib is None, "calib", "none beside a scene, which has its own", type(calib).__name__)
+        scene = frames
+        masks, bounds = scene.masks if masks is None else masks, scene.bounds if bounds is None else bounds
+        frames, calib = scene.frames, scene.calib
+    require(calib is not None, "calib", "cameras, one a frame, or a path", "none")
+    assert calib is not None
+    calib = as_calibration(calib)
     require(len(frames) == len(calib), "frames", f"{len(calib)}, one a camera", len(frames))
     calib.check_baselines()
-    given = check_bounds(bounds)
+    box = check_bounds(bounds)
     if isinstance(masks, str | Path):
         masks = find_masks(masks, frames)
     require(masks is None or len(masks) == len(frames), "masks", f"{len(frames)}, one a frame", len(masks or ()))
-    report = Report()
-    report.values |= {"views": len(frames), "matcher": config.matcher, "config": asdict(config)}
-    clock = _Clock(report)
-    with clock.stage("io"):
-        images, cut, cameras = _inputs(frames, calib, masks, config.depth.max_image_size, track)
-    views = Views(images, cut, cameras)
-    with clock.stage("sparse"):
-        plan = make_plan(views, given, config, report, track)
-    with clock.stage("depth"):
-        rough, depths = _depths(views, plan, config, track)
-    draft = None
-    if config.depth.surface_rounds and rough:
-        draft = make_draft(views, plan, depths, config, report, track, clock)
-        with clock.stage("depth"):
-            for n in track(rough, "depth, third pass", len(rough)):
-                depths[n] = third_pass(views, plan, n, depths[n], rough[n], draft.surface, config)
-    result = build(views, plan, depths, config, report, track, clock, draft)
-    result.cameras = Calibration(tuple(cameras), calib.source)
-    result.report["peak_memory_mib"] = round(_peak_memory() / 2**20)
-    return result
+    frame = LocalFrame.of(list(calib))
+    cameras = frame.cameras(list(calib))
+    inputs = Inputs(photographs(frames, cameras), None if masks is None else mask_sources(masks, cameras), cameras)
+    local = None if box is None else frame.inwards(box)
+    limit = config.depth.max_image_size
+    pixels = max(int(c.width * c.height * min(1.0, limit / max(c.width, c.height)) ** 2) for c in calib)
+    config, budget, threads = memory_settings(config, max_memory, pixels)
+    with open_session(workdir, executor, scheduler, budget, threads) as (place, runner):
+        return _reconstructed(Run(runner, config, track or no_track), inputs, calib, local, frame, place)
 
 
-def build(
-    views: Views,
-    plan: Plan,
-    depths: list[DepthMap | None],
-    config: Config,
-    report: Report,
-    track: Track = no_track,
-    clock: _Clock | None = None,
-    draft: Draft | None = None,
+def _reconstructed(
+    run: Run, inputs: Inputs, calib: Calibration, bounds: Bounds | None, frame: LocalFrame, workdir: Workdir
 ) -> Reconstruction:
-    """From depth maps (None where a view has none) to the textured mesh; a draft's silhouettes serve again, else they are sought."""
-    clock = clock or _Clock(Report())
-    with clock.stage("consistency"):
-        filtered = filter_views(views, plan, depths, config.depth, track)
-        loose = filter_views(views, plan, depths, config.depth.loosened(), track)
-        _say_kept(filtered, plan.sources, views.masks is not None, report)
-    found = draft.found if draft else _standing(views, plan, loose, config, report, clock)
-    with clock.stage("volume"):
-        surface = _isosurface(views, plan, loose, found, config, report)
-    if found is not None:
-        _say_completed(report)
-    return finish(views, plan, filtered, surface, config, report, track, clock, completed=found is not None)
+    config = run.config
+    whole, cameras = overview(inputs, config), reduced_cameras(inputs.cameras, config.depth.max_image_size)
+    run.all(whole, "images")
+    surveying = surveyed(whole, cameras, bounds, config)
+    run.all([surveying], "sparse points")
+    survey: Survey = run.value(surveying)
+    views, points, box, target = Views(whole, cameras), survey.points, survey.box, None
+    if inputs.masks is not None:
+        target, _ = located(whole, cameras, survey.box, bounds, None, config)
+        where = run.value(target)
+        if where.parts:
+            views, box = cropped(inputs, whole, where, None, config), where.box
+            run.all(views.pixels, "target")
+        points = no_points(len(cameras))
+    planning = planned(views, points, box, bounds is not None or views.masked, config)
+    plan: Plan = run.value(planning)
+    tasks = frame_tasks(views, plan, config, target=target)
+    run_frame(run, tasks)
+    return finished(run, views, plan, tasks, [survey.findings, plan.findings], survey.points, World(frame, calib, workdir))
 
 
-def _depths(views: Views, plan: Plan, config: Config, track: Track) -> tuple[dict[int, depth_stage.RoughDepth], list[DepthMap | None]]:
-    """The first and the second pass of the views that have sources."""
-    used = [n for n, s in enumerate(plan.sources) if s]
-    rough = {n: first_pass(views, plan, n, config) for n in track(used, "depth, first pass", len(used))}
-    depths: list[DepthMap | None] = [None] * len(views.images)
-    for n in track(used, "depth, second pass", len(used)):
-        depths[n] = second_pass(views, plan, n, rough, config, last=not config.depth.surface_rounds)
-    return rough, depths
+@dataclass(frozen=True)
+class World:
+    """How a result goes back to the caller: the frame, the cameras as calibrated, and where its depth maps lie."""
+
+    frame: LocalFrame
+    calib: Calibration
+    workdir: Workdir
+
+
+def finished(
+    run: Run, views: Views, plan: Plan, tasks: FrameTasks, findings: Sequence[Findings], points: SparsePoints, world: World
+) -> Reconstruction:
+    """A frame's result in the caller's frame, with its report."""
+    get, frame = run.runner.get, world.frame
+    mesh = get(tasks.textured)
+    box = frame.world(plan.box)
+    every = [*findings, get(tasks.kept), get(tasks.extracted).findings, get(tasks.cleaned).findings, mesh.findings]
+    every.append(Findings({"bounds": box.tolist()}))
+    cameras = zip(views.cameras, world.calib, strict=True)
+    return Reconstruction(
+        vertices=frame.world(mesh.vertices),
+        faces=mesh.faces,
+        uv=mesh.uv,
+        texture=mesh.texture,
+        depths=stored_depths(world.workdir, run.runner, tasks.filtered),
+        cameras=Calibration(tuple(replace(view, t=given.t) for view, given in cameras), world.calib.source),
+        sparse=replace(points, positions=frame.world(points.positions)),
+        bounds=box,
+        face_views=mesh.face_views,
+        report=assembled(every, run.ledger, run.config, len(views.pixels)),
+    )

@@ -1,64 +1,59 @@
-"""Times and warnings of a run."""
+"""The report of a run, put together from what its stages returned."""
 
 from __future__ import annotations
 
-import resource
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
-from ..errors import ReconstructionError
-from ..geometry.cameras import Camera
-from ..types import DepthMap, Report
+from ..config import Config
+from .stages import Findings
+from .tasks import Ledger
 
-
-class _Clock:
-    """CPU and wall seconds a stage, into the report; what is done twice adds up."""
-
-    def __init__(self, report: Report) -> None:
-        self.stages: dict[str, dict[str, float]] = {}
-        report.values["seconds"] = self.stages
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        wall, cpu = time.perf_counter(), time.process_time()
-        try:
-            yield
-        finally:
-            spent = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
-            before = self.stages.get(name, {})
-            self.stages[name] = {kind: round(before.get(kind, 0.0) + seconds, 3) for kind, seconds in spent.items()}
+GROUPS = {
+    "io": ("decode", "crop"),
+    "sparse": ("features", "survey", "plan"),
+    "silhouettes": ("backgrounds", "silhouettes", "locate"),
+    "depth": ("match", "refine", "rematch", "predict"),
+    "consistency": ("filtered", "kept_share"),
+    "volume": ("draft", "extract"),
+    "surface": ("clean",),
+    "texture": ("paint",),
+    "rigid": ("registered",),
+}
+"""Names in the report, and the stages whose seconds they sum."""
 
 
-def _say_left_out(sources: list[list[int]], cameras: Sequence[Camera], report: Report) -> None:
-    alone = [n for n, s in enumerate(sources) if not s]
-    report.values["left_out"] = alone
-    if len(alone) == len(sources):
-        raise ReconstructionError(
-            "no two views see the same surface from less than 65 degrees apart: check the poses, or add views in between"
-        )
-    for n in alone:
-        report.warn(f"view {n} ({cameras[n].name or 'unnamed'}) is left out: no other view sees its surface from a near enough angle")
+def assembled(findings: Sequence[Findings], ledger: Ledger, config: Config, views: int) -> dict[str, Any]:
+    """Figures and warnings of all stages, and what the run took."""
+    report: dict[str, Any] = {"views": views, "matcher": config.matcher, "config": asdict(config)}
+    warnings: list[str] = []
+    for one in findings:
+        report |= one.figures
+        warnings += [w for w in one.warnings if w not in warnings]
+    return report | {
+        "warnings": warnings,
+        "seconds": _seconds(ledger),
+        "tasks": {"run": ledger.run, "reused": ledger.reused},
+        "peak_memory_mib": round(peak_memory() / 2**20),
+    }
 
 
-def _say_kept(filtered: list[DepthMap | None], sources: list[list[int]], masked: bool, report: Report) -> None:
-    shares = [None if d is None else round(float((d.depth > 0).mean()), 4) for d in filtered]
-    report.values["depth"] = {"kept_share": shares, "sources": sources}
-    poor = [n for n, s in enumerate(shares) if s is not None and s < 0.01]
-    if poor and not masked:
-        report.warn(f"views {poor} contribute almost nothing: less than 1 % of their depth agrees with other views")
+def _seconds(ledger: Ledger) -> dict[str, dict[str, float]]:
+    out: dict[str, dict[str, float]] = {}
+    for name, members in GROUPS.items():
+        spent = [ledger.seconds[m] for m in members if m in ledger.seconds]
+        if spent:
+            out[name] = {kind: round(sum(s[kind] for s in spent), 3) for kind in ("wall", "cpu")}
+    return out
 
 
-def _say_completed(report: Report) -> None:
-    share = report.values["standing"]["measured"]
-    report.warn(
-        f"the depth maps show only {share:.0%} of what stands in the middle: its outlines in the photographs complete it, "
-        "and hollows that no outline shows are filled"
-    )
-
-
-def _peak_memory() -> int:
-    """Bytes of the largest resident set of this process so far."""
+def peak_memory() -> int:
+    """Bytes of the largest resident set of this process so far; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

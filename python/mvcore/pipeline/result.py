@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,7 +41,7 @@ class Reconstruction:
     faces: NDArray[np.uint32]
     uv: NDArray[np.float32]
     texture: Image
-    depths: list[DepthMap | None]
+    depths: Sequence[DepthMap | None]
     cameras: Calibration
     sparse: SparsePoints
     bounds: Bounds

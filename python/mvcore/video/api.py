@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -15,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..config import Config
 from ..errors import require
 from ..geometry.cameras import Calibration, Camera
+from ..geometry.local_frame import LocalFrame
 from ..io.clips import Clips, Source, load_video
 from ..io.images import find_pictures, read_image, undistort
 from ..pipeline.reconstruct import check_bounds
 from ..pipeline.result import Reconstruction
 from ..types import Image, Track, no_track
-from .run import Run
-from .stages import Job
+from .run import ClipRun, Job
 from .tracking import split_targets
 from .writer import SequenceWriter
 
@@ -75,6 +74,7 @@ def reconstruct_video(
     executor: Executor | None = None,
     scheduler: str | None = None,
     workdir: str | Path | None = None,
+    max_memory: int | None = None,
     track: Track | None = None,
 ) -> VideoReconstruction:
     """Synchronised clips in, a textured mesh an instant out.
@@ -92,6 +92,7 @@ def reconstruct_video(
     executor : where the work runs, any concurrent.futures executor; by default local threads.
     scheduler : address of a dask.distributed scheduler instead, ``tcp://host:port``; ``workdir`` must then be a folder that all share.
     workdir : keeps results by content; the same call goes on there after an interruption. By default a temporary folder.
+    max_memory : bytes that the process may take beyond what it takes idle.
 
     Returns
     -------
@@ -113,22 +114,24 @@ def reconstruct_video(
         clips = with_calibration(clips, calib)
     clips.calib.check_baselines()
     names = [c.name for c in clips.clips]
-    plates = (None,) * len(names) if background is False else _plates(clips, background)
-    temporary = None if workdir is not None else tempfile.mkdtemp(prefix="mvcore-")
+    plates = [None] * len(names) if background is False else _plates(clips, background)
+    frame = LocalFrame.of(list(clips.calib))
+    box = check_bounds(bounds)
     job = Job(
         clips,
         None if masks is None else _mask_clips(masks, clips),
         plates,
         _regions(regions or {}, clips),
         background is False and masks is None,
-        check_bounds(bounds),
+        None if box is None else frame.inwards(box),
         config,
-        Path(workdir if workdir is not None else temporary or "").absolute(),
+        frame,
     )
     if target == "rigid":
         require(not job.whole, "background", "a target for target='rigid'", "False: the whole scene")
     run = VideoReconstruction(clips.times, names, list(clips.warnings), iter(()))
-    run._instants = Run(job, run, target == "rigid", executor, scheduler, track or no_track, temporary).instants()
+    clip_run = ClipRun(job, run, target == "rigid", executor, scheduler, workdir, max_memory, track or no_track)
+    run._instants = clip_run.frames()
     return run
 
 
@@ -176,17 +179,17 @@ def _by_camera(mapping: Mapping[str, Any], clips: Clips, label: str) -> list[Any
     return [mapping.get(n) for n in names]
 
 
-def _plates(clips: Clips, background: Any) -> tuple[Image | None, ...]:
+def _plates(clips: Clips, background: Any) -> list[Image | None]:
     if isinstance(background, str | Path):
         background = find_pictures(background, [c.name for c in clips.clips])
     given = [c.plate for c in clips.clips] if not isinstance(background, Mapping) else _by_camera(background, clips, "background")
     pictures = zip(given, clips.clips, clips.calib, strict=True)
-    return tuple(None if g is None else _picture(g, camera, f"background of {clip.name}") for g, clip, camera in pictures)
+    return [None if g is None else _picture(g, camera, f"background of {clip.name}") for g, clip, camera in pictures]
 
 
-def _regions(regions: Mapping[str, Any], clips: Clips) -> tuple[NDArray[np.uint8] | None, ...]:
+def _regions(regions: Mapping[str, Any], clips: Clips) -> list[NDArray[np.uint8] | None]:
     given = zip(_by_camera(regions, clips, "regions"), clips.clips, clips.calib, strict=True)
-    return tuple(None if r is None else _picture(r, camera, f"region of {clip.name}").max(2) for r, clip, camera in given)
+    return [None if r is None else _picture(r, camera, f"region of {clip.name}").max(2) for r, clip, camera in given]
 
 
 __all__ = ["VideoReconstruction", "reconstruct_video"]

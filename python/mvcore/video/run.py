@@ -1,32 +1,59 @@
-"""The run over a clip: chains of instants, each starting from the one before, sent to a pool; results come in order."""
+"""The run over a clip: chains of frames, each of which starts from the one before; results come in order."""
 
 from __future__ import annotations
 
-import shutil
+import queue
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MvcoreError, ReconstructionError
+from ..config import Config
+from ..errors import ReconstructionError, require
 from ..geometry.cameras import Calibration
-from ..pipeline.executors import Pool, open_pool
+from ..geometry.local_frame import LocalFrame
+from ..io.clips import Clips
+from ..pipeline import rigid, stages
+from ..pipeline.graph import (
+    Before,
+    FrameTasks,
+    Inputs,
+    Run,
+    Views,
+    cropped,
+    frame_tasks,
+    located,
+    overview,
+    planned,
+    reduced_cameras,
+    run_frame,
+    surveyed,
+)
+from ..pipeline.reconstruct import World, finished
+from ..pipeline.report import assembled
 from ..pipeline.result import Reconstruction
-from ..pipeline.store import digest
-from ..types import Track
-from . import rigid
-from . import stages as work
-from .stages import NO_POINTS, Job, filtered_of, prepared, stored
+from ..pipeline.session import Workdir, memory_settings, open_session
+from ..pipeline.sources import ClipFrame, clip_frames
+from ..pipeline.stages import Findings, Plan, Survey, Target
+from ..pipeline.tasks import Runner, Task, task
+from ..silhouettes.background_subtraction import Background
+from ..types import Bounds, Image, SparsePoints, Track
 from .tracking import Tracker
+
+T = TypeVar("T")
+
+STEPS = 10
+"""Steps of progress that a frame counts as."""
+MODEL_WITNESSES = 12
+"""Views that a depth of a rigid model is checked against: those of other frames stand near."""
 
 
 class Outcome(Protocol):
-    """What a run tells of itself as it goes."""
+    """What a run says of itself as it goes."""
 
     warnings: list[str]
     seconds: list[float]
@@ -34,248 +61,274 @@ class Outcome(Protocol):
     trajectory: NDArray[np.float64] | None
 
 
+@dataclass(frozen=True)
+class Job:
+    """A clip's inputs, in the local frame. ``plates`` and ``regions`` are None where a camera has none."""
+
+    clips: Clips
+    masks: Clips | None
+    plates: list[Image | None]
+    regions: list[NDArray[np.uint8] | None]
+    whole: bool
+    bounds: Bounds | None
+    config: Config
+    frame: LocalFrame
+
+    def inputs(self, frame: int) -> Inputs:
+        """Of one frame."""
+        masks = None if self.masks is None else clip_frames(self.masks, frame)
+        return Inputs(list(clip_frames(self.clips, frame)), masks, list(self.cameras))
+
+    @property
+    def cameras(self) -> list[Any]:
+        """As calibrated, in the local frame."""
+        return self.frame.cameras(list(self.clips.calib))
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Once a clip: the survey of its first frame, and the cameras' backgrounds where targets are found against them."""
+
+    survey: Survey
+    backgrounds: Task[list[Background]] | None
+
+
 @dataclass
-class Run:
-    """Sends out the work and yields the instants in order."""
+class FrameDone:
+    """A frame's tasks, done; no ``views`` where no target is seen."""
+
+    number: int
+    target: Task[Target] | None
+    seconds: float
+    run: Run
+    views: Views | None = None
+    plan: Plan | None = None
+    tasks: FrameTasks | None = None
+    points: SparsePoints | None = None
+    findings: tuple[Findings, ...] = ()
+
+
+@dataclass
+class ClipRun:
+    """Sends out the work and yields the frames' reconstructions in order."""
 
     job: Job
     out: Outcome
     rigid: bool
     executor: Executor | None
     scheduler: str | None
+    workdir: Any
+    max_memory: int | None
     track: Track
-    temporary: str | None
-
-    def instants(self) -> Iterator[Reconstruction]:
-        """The reconstructions; the model of a rigid target after the last one."""
-        try:
-            with open_pool(self.executor, self.scheduler) as pool:
-                yield from self._instants(pool)
-        finally:
-            if self.temporary is not None:
-                shutil.rmtree(self.temporary, ignore_errors=True)
-
-    def _instants(self, pool: Pool) -> Iterator[Reconstruction]:
-        job, count = self.job, len(self.job.clips)
-        started = time.perf_counter()
-        # Without masks and plates the background depends on samples of the whole clips, else on the first instant alone.
-        unknown = job.masks is None and not job.whole and any(p is None for p in job.plates)
-        looked = work.learning_samples(job) if unknown else job.clips.numbers[:1]
-        seen = digest([work.frames_key(job.clips, numbers) for numbers in (job.clips.numbers[0], *looked)])
-        learn_key = digest("learn", work.base_key(job), seen)
-        pool.start(work.learn, job, learn_key)()
-        self.out.warnings += stored(job, learn_key).meta["warnings"]
-        learnt = time.perf_counter() - started
-        chain = _Chain(job, pool, learn_key)
-        drivers = ThreadPoolExecutor(max(1, job.config.video.chains), thread_name_prefix="mvcore-chain")
-        try:
-            size = job.config.video.segment
-            done: dict[int, Future[_Done]] = {t: Future() for t in range(count)}
-            for first in range(0, count, size):
-                drivers.submit(chain.run, range(first, min(first + size, count)), done)
-            results: list[_Done] = []
-            tracker = Tracker()
-            for t in self.track(range(count), "instants", count):
-                results.append(done[t].result())
-                self.out.seconds.append(results[-1].seconds + (learnt if t == 0 else 0.0))
-                yield self._reconstruction(results[-1], tracker)
-            if self.rigid:
-                self._fuse_all(pool, results)
-        finally:
-            chain.stopped = True
-            drivers.shutdown(cancel_futures=True)
-
-    def _reconstruction(self, done: _Done, tracker: Tracker) -> Reconstruction:
-        job = self.job
-        if done.mesh is None:
-            return _empty(job, done)
-        views, plan, entry = prepared(job, done.prepare)
-        mesh, field = stored(job, done.mesh), stored(job, done.fuse)
-        a = mesh.arrays
-        report = mesh.meta["report"] | {
-            "instant": done.instant,
-            "time": float(job.clips.times[done.instant]),
-            "targets": tracker.follow(done.instant, entry.meta["targets"]),
-        }
-        return Reconstruction(
-            vertices=a["vertices"],
-            faces=a["faces"],
-            uv=a["uv"],
-            texture=a["texture"],
-            depths=filtered_of(field.arrays, len(views.images)),
-            cameras=Calibration(tuple(views.cameras)),
-            sparse=plan.points,
-            bounds=plan.box,
-            face_views=a["face_views"],
-            report=report,
-        )
-
-    def _fuse_all(self, pool: Pool, results: Sequence[_Done]) -> None:
-        job, seen = self.job, [d for d in results if d.mesh is not None]
-        if len(seen) < 2:
-            raise ReconstructionError(f"a rigid model needs the target at two instants at least, it is seen at {len(seen)}")
-        named = [(d.prepare, d.fuse, d.mesh or "") for d in seen]
-        poses_key = digest("poses", named)
-        pool.start(rigid.poses, job, poses_key, named)()
-        poses = stored(job, poses_key)
-        self.out.trajectory = np.full((len(results), 4, 4), np.nan)
-        self.out.trajectory[[d.instant for d in seen]] = poses.arrays["poses"]
-        # Spread over the clip: more instants add little, and all are kept in memory.
-        chosen = sorted({int(n) for n in np.linspace(0, len(seen) - 1, min(len(seen), job.config.video.model_instants)).round()})
-        prepares = tuple(seen[n].prepare for n in chosen)
-        used = digest("chosen", poses_key, chosen)
-        if used not in job.store:
-            job.store.save(used, poses.arrays | {"poses": poses.arrays["poses"][chosen]}, poses.meta)
-        plan_key = digest("model plan", used, prepares)
-        pool.start(rigid.model_plan, job, plan_key, prepares, used)()
-        views = [n for n, s in enumerate(stored(job, plan_key).meta["sources"]) if s]
-        seconds = {n: digest("model second", plan_key, n) for n in views}
-        model_key = digest("model", plan_key)
-        if model_key not in job.store:
-            firsts = {n: digest("model first", plan_key, n) for n in views}
-
-            def first(n: int) -> Callable[[], Any]:
-                return pool.start(rigid.model_first, job, firsts[n], prepares, used, n)
-
-            def second(n: int) -> Callable[[], Any]:
-                return pool.start(rigid.model_second, job, seconds[n], prepares, used, n, firsts)
-
-            _match(job, firsts, seconds, first, second)
-            pool.start(rigid.model, job, model_key, prepares, used, seconds)()
-        entry = stored(job, model_key)
-        a = entry.arrays
-        self.out.model = Reconstruction(
-            vertices=a["vertices"],
-            faces=a["faces"],
-            uv=a["uv"],
-            texture=a["texture"],
-            depths=[],
-            cameras=Calibration(()),
-            sparse=NO_POINTS,
-            bounds=a["box"],
-            face_views=a["face_views"],
-            report=entry.meta["report"],
-        )
-
-
-def _match(
-    job: Job,
-    firsts: dict[int, str],
-    seconds: dict[int, str],
-    first: Callable[[int], Callable[[], Any]],
-    second: Callable[[int], Callable[[], Any]],
-) -> None:
-    """Both passes of all views whose second is missing; the first ones' results are large, and of no use afterwards."""
-    missing = [n for n, key in seconds.items() if key not in job.store]
-    if not missing:
-        return
-    for start, views in ((first, list(firsts)), (second, missing)):
-        for wait in [start(n) for n in views]:
-            wait()
-    for key in firsts.values():
-        job.store.path(key).unlink(missing_ok=True)
-
-
-def _empty(job: Job, done: _Done) -> Reconstruction:
-    entry = stored(job, done.prepare)
-    return Reconstruction(
-        vertices=np.zeros((0, 3)),
-        faces=np.zeros((0, 3), np.uint32),
-        uv=np.zeros((0, 2), np.float32),
-        texture=np.zeros((1, 1, 3), np.uint8),
-        depths=[None] * len(job.clips.clips),
-        cameras=job.clips.calib,
-        sparse=NO_POINTS,
-        bounds=entry.arrays["box"],
-        report={"instant": done.instant, "time": float(job.clips.times[done.instant]), "warnings": entry.meta["warnings"], "targets": []},
-    )
-
-
-@dataclass(frozen=True)
-class _Done:
-    """Keys of an instant's results; no mesh where no target is seen."""
-
-    instant: int
-    prepare: str
-    depths: dict[int, str]
-    fuse: str
-    mesh: str | None
-    seconds: float
-
-
-@dataclass
-class _Chain:
-    """The work of consecutive instants, each of which starts from the one before."""
-
-    job: Job
-    pool: Pool
-    learn_key: str
+    steps: queue.SimpleQueue[None] = field(default_factory=queue.SimpleQueue)
     stopped: bool = False
 
-    def run(self, instants: range, done: dict[int, Future[_Done]]) -> None:
-        """Sets each instant's future; an error fails it and all that follow it."""
-        before: _Done | None = None
-        ready: tuple[str, Callable[[], Any]] | None = None
-        for t in instants:
-            if self.stopped:
-                for later in instants:
-                    done[later].cancel()  # another chain may be waiting for it
-                return
+    def frames(self) -> Iterator[Reconstruction]:
+        """The reconstructions; the model of a rigid target after the last one."""
+        pixels = max(c.width * c.height for c in self.job.clips.calib)
+        config, budget, threads = memory_settings(self.job.config, self.max_memory, pixels)
+        self.job = replace(self.job, config=config)
+        with open_session(self.workdir, self.executor, self.scheduler, budget, threads) as (place, runner):
+            yield from self._frames(runner, place)
+
+    def _frames(self, runner: Runner, workdir: Workdir) -> Iterator[Reconstruction]:
+        count, started = len(self.job.clips), time.perf_counter()
+        learnt = self._learn(Run(runner, self.job.config, self.track))
+        self.out.warnings += learnt.survey.findings.warnings
+        learning = time.perf_counter() - started
+        world = World(self.job.frame, self.job.clips.calib, workdir)
+        drivers = ThreadPoolExecutor(max(1, self.job.config.video.chains), thread_name_prefix="mvcore-chain")
+        try:
+            size = self.job.config.video.segment
+            done: dict[int, Future[FrameDone]] = {t: Future() for t in range(count)}
+            for first in range(0, count, size):
+                drivers.submit(self._chain, runner, learnt, range(first, min(first + size, count)), done)
+            tracker, results = Tracker(), []
+            for t in self._progress(done):
+                results.append(done[t].result())
+                self.out.seconds.append(results[-1].seconds + (learning if t == 0 else 0.0))
+                yield self._reconstruction(results[-1], tracker, learnt, world)
+            if self.rigid:
+                self._model(Run(runner, self.job.config, self.track), results, world)
+        finally:
+            self.stopped = True
+            drivers.shutdown(cancel_futures=True)
+
+    def _progress(self, done: dict[int, Future[FrameDone]]) -> Iterator[int]:
+        """The numbers of the frames as they are done, in order, with progress in steps between them."""
+
+        def events() -> Iterator[int | None]:
+            shown = 0
+            for t, future in done.items():
+                while not future.done():
+                    try:
+                        self.steps.get(timeout=0.1)
+                    except queue.Empty:
+                        continue
+                    if shown < STEPS * len(done) - 1:
+                        shown += 1
+                        yield None
+                while shown < STEPS * (t + 1) - 1:
+                    shown += 1
+                    yield None
+                shown = max(shown, STEPS * (t + 1))
+                yield t
+
+        yield from (t for t in self.track(events(), "frames", STEPS * len(done)) if t is not None)
+
+    # ---- once a clip
+
+    def _learn(self, run: Run) -> Learnt:
+        """The calibration's health, the volume to look at, and the backgrounds."""
+        job, config = self.job, self.job.config
+        inputs = job.inputs(0)
+        whole = overview(inputs, config)
+        run.all(whole, "images")
+        surveying = surveyed(whole, reduced_cameras(inputs.cameras, config.depth.max_image_size), job.bounds, config)
+        run.all([surveying], "sparse points")
+        survey: Survey = run.value(surveying)
+        if job.masks is not None or job.whole:
+            return Learnt(survey, None)
+        missing = [n for n, plate in enumerate(job.plates) if plate is None]
+        learnt = self._learnt_plates(run, missing, survey.box) if missing else None
+        backgrounds = task(stages.all_backgrounds, learnt, job.plates, job.regions)
+        run.all([backgrounds], "background")
+        return Learnt(survey, backgrounds)
+
+    def _learnt_plates(self, run: Run, missing: list[int], box: Bounds) -> Task[list[Background]]:
+        """From samples of the whole clips, whatever part is reconstructed."""
+        job, config = self.job, self.job.config.target
+        line = job.clips.timeline
+        chosen = line[sorted({int(n) for n in np.linspace(0, len(line) - 1, min(len(line), config.samples)).round()})]
+        require(len(chosen) >= 3, "background", "a clean plate of every camera, or at least 3 frames to learn it from", len(chosen))
+        samples = []
+        for n in missing:
+            clip, camera = job.clips.clips[n], job.cameras[n]
+            samples += [task(stages.decode, ClipFrame.of(clip, int(t)), None, camera, config.max_size) for t in chosen[:, n]]
+        run.all(samples, "background samples")
+        cameras = reduced_cameras([job.cameras[n] for n in missing], config.max_size)
+        counts = [len(chosen)] * len(missing)
+        learnt = task(stages.backgrounds, samples, counts, cameras, box, config, job.config.carve)
+        run.all([learnt], "background")
+        return learnt
+
+    # ---- frames
+
+    def _chain(self, runner: Runner, learnt: Learnt, frames: range, done: dict[int, Future[FrameDone]]) -> None:
+        """Sets each frame's future; an error fails it and all that follow it."""
+        before: FrameDone | None = None
+        for t in frames:
             try:
-                prepared = ready or self._start_preparing(t)
-                ready = None
-                if t + 1 in instants:
-                    with suppress(OSError, MvcoreError):  # what is wrong with the next instant is told in its turn
-                        ready = self._start_preparing(t + 1)
-                # Colours are settled once a clip, at its first instant; without a target there, where the chain first sees one.
-                gains = None if t == 0 else done[0].result().mesh
-                if gains is None and before is not None:
-                    gains = before.mesh
-                before = self._instant(t, prepared, before, gains)
+                if self.stopped:
+                    raise ReconstructionError("the run was stopped")
+                # Colours are settled once a clip, at its first frame; without a target there, where the chain first sees one.
+                settled = None if t == 0 else done[0].result().tasks
+                if settled is None and before is not None:
+                    settled = before.tasks
+                run = Run(runner, self.job.config, self._step)
+                before = self._frame(run, learnt, t, before, settled)
                 done[t].set_result(before)
             except BaseException as error:
-                for later in instants:
+                for later in frames:
                     if later >= t:
                         done[later].set_exception(error)
                 return
 
-    def _start_preparing(self, t: int) -> tuple[str, Callable[[], Any]]:
-        job = self.job
-        masks = None if job.masks is None else work.frames_key(job.masks, job.masks.numbers[t])
-        key = digest("prepare", self.learn_key, work.frames_key(job.clips, job.clips.numbers[t]), masks)
-        return key, self.pool.start(work.prepare, job, key, self.learn_key, t)
+    def _step(self, items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
+        yield from items
+        self.steps.put(None)
 
-    def _instant(self, t: int, prepared: tuple[str, Callable[[], Any]], before: _Done | None, gains: str | None) -> _Done:
-        job, pool = self.job, self.pool
-        started = time.perf_counter()
-        prepare, wait = prepared
-        wait()
-        meta = stored(job, prepare).meta
-        if meta["empty"]:
-            return _Done(t, prepare, {}, "", None, time.perf_counter() - started)
-        begun = None if before is None or before.mesh is None else digest("expect", prepare, before.mesh)
-        # What is removed again bears the instant's number: another chain may be at the same frames.
-        expect = None if begun is None else digest(begun, t)
-        used = [n for n, s in enumerate(meta["sources"]) if s]
-        fuse = digest("fuse", prepare, begun)
-        mesh = digest("mesh", fuse, begun, gains)
-        seconds = {n: digest("second", prepare, n, begun) for n in used}
-        if fuse in job.store and mesh in job.store:
-            return _Done(t, prepare, seconds, fuse, mesh, time.perf_counter() - started)
-        if before is not None and expect is not None and expect not in job.store:
-            pool.start(work.expect, job, expect, prepare, before.mesh, before.prepare)()
-        if fuse not in job.store:
-            firsts = {n: digest("first", prepare, n, begun, t) for n in used}
+    def _frame(self, run: Run, learnt: Learnt, t: int, before: FrameDone | None, settled: FrameTasks | None) -> FrameDone:
+        job, config, started = self.job, self.job.config, time.perf_counter()
+        inputs = job.inputs(t)
+        whole, cameras = overview(inputs, config), reduced_cameras(inputs.cameras, config.depth.max_image_size)
+        run.all(whole, "images")
+        target, found = None, ()
+        if job.whole:
+            survey: Survey = run.value(surveyed(whole, cameras, job.bounds, config))
+            views, points, box, found = Views(whole, cameras), survey.points, survey.box, (survey.findings,)
+        else:
+            target, silhouettes = located(whole, cameras, learnt.survey.box, job.bounds, learnt.backgrounds, config)
+            where: Target = run.value(target)
+            if not where.parts:
+                return FrameDone(t, target, time.perf_counter() - started, run)
+            views, box, points = cropped(inputs, whole, where, silhouettes, config), where.box, stages.no_points(len(cameras))
+            run.all(views.pixels, "target")
+            found = (learnt.survey.findings,) if t == 0 else ()
+        plan: Plan = run.value(planned(views, points, box, not job.whole or job.bounds is not None, config))
+        prediction = None
+        if before is not None and before.tasks is not None:
+            prediction = task(stages.predict, before.tasks.textured, before.target, target)
+        tasks = frame_tasks(views, plan, config, Before(prediction, settled.textured if settled else None), target)
+        run_frame(run, tasks)
+        if t == 0 and not job.whole:
+            points = learnt.survey.points
+        return FrameDone(t, target, time.perf_counter() - started, run, views, plan, tasks, points, (*found, plan.findings))
 
-            def first(n: int) -> Callable[[], Any]:
-                return pool.start(work.first, job, firsts[n], prepare, n, expect)
+    def _reconstruction(self, done: FrameDone, tracker: Tracker, learnt: Learnt, world: World) -> Reconstruction:
+        where = {"instant": done.number, "time": float(self.job.clips.times[done.number])}
+        if done.tasks is None or done.views is None or done.plan is None or done.points is None:
+            return self._empty(done, learnt, where, world)
+        result = finished(done.run, done.views, done.plan, done.tasks, done.findings, done.points, world)
+        parts = done.run.value(done.target).parts if done.target is not None else []
+        placed = [p | {"middle": world.frame.world(p["middle"]).tolist(), "box": world.frame.world(p["box"]).tolist()} for p in parts]
+        result.report |= where | {"targets": tracker.follow(done.number, placed)}
+        return result
 
-            def second(n: int) -> Callable[[], Any]:
-                return pool.start(work.second, job, seconds[n], prepare, n, firsts)
+    def _empty(self, done: FrameDone, learnt: Learnt, where: dict[str, Any], world: World) -> Reconstruction:
+        said = Findings(where | {"targets": []}, ["no target is seen at this frame"])
+        return Reconstruction(
+            vertices=np.zeros((0, 3)),
+            faces=np.zeros((0, 3), np.uint32),
+            uv=np.zeros((0, 2), np.float32),
+            texture=np.zeros((1, 1, 3), np.uint8),
+            depths=[None] * len(self.job.clips.clips),
+            cameras=self.job.clips.calib,
+            sparse=stages.no_points(len(self.job.clips.clips)),
+            bounds=world.frame.world(learnt.survey.box),
+            report=assembled([said], done.run.ledger, self.job.config, len(self.job.clips.clips)),
+        )
 
-            _match(job, firsts, seconds, first, second)
-            pool.start(work.fuse, job, fuse, prepare, seconds)()
-        pool.start(work.mesh, job, mesh, prepare, fuse, expect, gains)()
-        if expect is not None:
-            job.store.path(expect).unlink(missing_ok=True)
-        return _Done(t, prepare, seconds, fuse, mesh, time.perf_counter() - started)
+    # ---- a rigid target
+
+    def _model(self, run: Run, results: Sequence[FrameDone], world: World) -> None:
+        """Poses of a rigid target, and one model of all frames' views."""
+        seen = [d for d in results if d.tasks is not None and d.views is not None and d.plan is not None]
+        if len(seen) < 2:
+            raise ReconstructionError(f"a rigid model needs the target at two instants at least, it is seen at {len(seen)}")
+        config = self.job.config.video
+        clouds = []
+        for number, d in enumerate(seen):
+            assert d.tasks is not None
+            assert d.views is not None
+            clouds.append(task(rigid.cloud, d.tasks.filtered, d.tasks.textured, d.views.cameras, config.registration_points, number))
+        run.all(clouds, "surfaces of the frames")
+        assert seen[0].plan is not None
+        registering = task(rigid.registered, clouds, seen[0].plan.box, config.registration_rounds)
+        run.all([registering], "poses")
+        trajectory: rigid.Trajectory = run.value(registering)
+        self.out.trajectory = np.full((len(results), 4, 4), np.nan)
+        self.out.trajectory[[d.number for d in seen]] = world.frame.pose(trajectory.poses)
+        # Spread over the clip: more frames add little.
+        chosen = sorted({int(n) for n in np.linspace(0, len(seen) - 1, min(len(seen), config.model_instants)).round()})
+        views = _gathered([(seen[n].views, trajectory.poses[n]) for n in chosen])
+        # With so many views less noise is left to be smoothed away than at one frame.
+        volume = self.job.config.volume
+        settings = replace(self.job.config, volume=replace(volume, solid_smoothing=volume.smoothing))
+        plan: Plan = run.value(planned(views, stages.no_points(len(views.cameras)), seen[0].plan.box, True, settings))
+        tasks = frame_tasks(views, plan, settings, witnesses=MODEL_WITNESSES)
+        run_frame(run, tasks)
+        everywhere = replace(world, calib=Calibration(tuple(c for _ in chosen for c in world.calib)))
+        findings = [trajectory.findings, plan.findings]
+        self.out.model = finished(run, views, plan, tasks, findings, stages.no_points(len(views.cameras)), everywhere)
+
+
+def _gathered(frames: Sequence[tuple[Views | None, NDArray[np.float64]]]) -> Views:
+    """Views of several frames in the target's frame, as if it had stood still and the cameras had moved."""
+    pixels, cameras, windows = [], [], []
+    for views, pose in frames:
+        assert views is not None
+        pixels += views.pixels
+        cameras += [c.moved(pose) for c in views.cameras]
+        windows += views.windows or []
+    return Views(pixels, cameras, windows, masked=True)

@@ -51,7 +51,7 @@ def write_page(folder: str | Path, page: str | Path | None = None) -> Path:
         data["poses"] = index["rigid"]["poses"]
     # "</" must not end the script that holds the data.
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-    template = Template(files("mvcore").joinpath("viewer.html").read_text(encoding="utf-8"))
+    template = Template(files("mvcore").joinpath("viewer/page.html").read_text(encoding="utf-8"))
     html = template.substitute(library=_library(), data=text, title=folder.resolve().name)
     atomically(page, lambda p: p.write_text(html, encoding="utf-8") and None)
     return page

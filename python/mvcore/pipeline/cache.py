@@ -1,0 +1,105 @@
+"""Results by key, as values in memory up to a number of bytes, the others in a `Store`."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+from .store import Store
+from .values import pack, unpack
+
+
+class Missing(LookupError):
+    """A result that was there is gone or damaged; whoever knows how it was made makes it again."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(key)
+        self.key = key
+
+
+class Cache:
+    """Values by key. Thread-safe.
+
+    Parameters
+    ----------
+    folder : of the store.
+    budget : bytes of values kept in memory; the least recently used ones leave first.
+    through : every value is written at once; else only those that leave memory (one process, a temporary folder).
+    """
+
+    def __init__(self, folder: Path, budget: int, through: bool) -> None:
+        self.store, self.budget, self.through = Store(folder), budget, through
+        self._values: OrderedDict[str, tuple[Any, int]] = OrderedDict()
+        self._held = 0
+        self._lock = threading.RLock()
+
+    def __contains__(self, key: str) -> bool:
+        with self._lock:
+            return key in self._values or key in self.store
+
+    def get(self, key: str) -> Any:
+        """A value.
+
+        Raises
+        ------
+        Missing
+            It is not there, or what is there is damaged.
+        """
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key][0]
+        entry = self.store.load(key)
+        if entry is None:
+            raise Missing(key)
+        try:
+            value = unpack(entry.arrays, entry.meta["value"])
+        except (ValueError, KeyError):
+            self.store.path(key).unlink(missing_ok=True)
+            raise Missing(key) from None
+        self._keep(key, value, sum(a.nbytes for a in entry.arrays.values()))
+        return value
+
+    def put(self, key: str, value: Any) -> None:
+        """Keep a value."""
+        arrays, tree = pack(value)
+        if self.through:
+            self.store.save(key, arrays, {"value": tree})
+        self._keep(key, value, sum(a.nbytes for a in arrays.values()))
+
+    def drop(self, key: str) -> None:
+        """Forget a value, on disk as well."""
+        with self._lock:
+            self._held -= self._values.pop(key, (None, 0))[1]
+        self.store.path(key).unlink(missing_ok=True)
+
+    def _keep(self, key: str, value: Any, size: int) -> None:
+        with self._lock:
+            self._held += size - self._values.pop(key, (None, 0))[1]
+            self._values[key] = (value, size)
+            while self._held > self.budget and self._values:
+                old, (left, bytes_) = self._values.popitem(last=False)
+                if old not in self.store:
+                    arrays, tree = pack(left)
+                    self.store.save(old, arrays, {"value": tree})
+                self._held -= bytes_
+
+
+_CACHES: dict[Path, Cache] = {}
+_LOCK = threading.Lock()
+
+
+def cache_of(folder: Path, budget: int, through: bool) -> Cache:
+    """The process's cache of a folder: tasks of one process share it."""
+    with _LOCK:
+        if folder not in _CACHES:
+            _CACHES[folder] = Cache(folder, budget, through)
+        return _CACHES[folder]
+
+
+def forget(folder: Path) -> None:
+    """Drop the process's cache of a folder; what lies there stays."""
+    with _LOCK:
+        _CACHES.pop(folder, None)
