@@ -89,3 +89,12 @@ def test_import_is_light():
     code = "import sys, mvcore; print([m for m in ('torch', 'cv2', 'trimesh', 'typer') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_functions_are_short():
+    """A function that wants to be longer is two ideas; the docstring counts."""
+    for file in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                assert lines <= 60, f"{file.relative_to(PACKAGE)}: {node.name} has {lines} lines"

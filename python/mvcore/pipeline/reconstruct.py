@@ -90,14 +90,32 @@ def reconstruct(
     >>> scene = mvcore.load("fountain/")  # doctest: +SKIP
     >>> mvcore.reconstruct(scene).save("fountain.glb")  # doctest: +SKIP
     """
-    config = config if isinstance(config, Config) else Config.from_dict(config or {})
+    settings = config if isinstance(config, Config) else Config.from_dict(config or {})
+    request = _request(frames, calib, masks, bounds)
+    limit = settings.depth.max_image_size
+    pixels = max(int(c.width * c.height * min(1.0, limit / max(c.width, c.height)) ** 2) for c in request.calib)
+    settings, budget, threads = memory_settings(settings, max_memory, pixels)
+    with open_session(workdir, executor, scheduler, budget, threads) as (place, runner):
+        return _reconstructed(Run(runner, settings, track or no_track), request, place)
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What a caller asks for, checked; inputs and bounds in the local frame."""
+
+    inputs: Inputs
+    calib: Calibration
+    bounds: Bounds | None
+    frame: LocalFrame
+
+
+def _request(frames: Any, calib: Any, masks: Any, bounds: ArrayLike | None) -> _Request:
     if isinstance(frames, Scene):
         require(calib is None, "calib", "none beside a scene, which has its own", type(calib).__name__)
         scene = frames
         masks, bounds = scene.masks if masks is None else masks, scene.bounds if bounds is None else bounds
         frames, calib = scene.frames, scene.calib
     require(calib is not None, "calib", "cameras, one a frame, or a path", "none")
-    assert calib is not None
     calib = as_calibration(calib)
     require(len(frames) == len(calib), "frames", f"{len(calib)}, one a camera", len(frames))
     calib.check_baselines()
@@ -108,18 +126,11 @@ def reconstruct(
     frame = LocalFrame.of(list(calib))
     cameras = frame.cameras(list(calib))
     inputs = Inputs(photographs(frames, cameras), None if masks is None else mask_sources(masks, cameras), cameras)
-    local = None if box is None else frame.inwards(box)
-    limit = config.depth.max_image_size
-    pixels = max(int(c.width * c.height * min(1.0, limit / max(c.width, c.height)) ** 2) for c in calib)
-    config, budget, threads = memory_settings(config, max_memory, pixels)
-    with open_session(workdir, executor, scheduler, budget, threads) as (place, runner):
-        return _reconstructed(Run(runner, config, track or no_track), inputs, calib, local, frame, place)
+    return _Request(inputs, calib, None if box is None else frame.inwards(box), frame)
 
 
-def _reconstructed(
-    run: Run, inputs: Inputs, calib: Calibration, bounds: Bounds | None, frame: LocalFrame, workdir: Workdir
-) -> Reconstruction:
-    config = run.config
+def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruction:
+    config, inputs, bounds = run.config, request.inputs, request.bounds
     whole, cameras = overview(inputs, config), reduced_cameras(inputs.cameras, config.depth.max_image_size)
     run.all(whole, "images")
     surveying = surveyed(whole, cameras, bounds, config)
@@ -137,7 +148,8 @@ def _reconstructed(
     plan: Plan = run.value(planning)
     tasks = frame_tasks(views, plan, config, target=target)
     run_frame(run, tasks)
-    return finished(run, views, plan, tasks, [survey.findings, plan.findings], survey.points, World(frame, calib, workdir))
+    world = World(request.frame, request.calib, workdir)
+    return finished(run, views, plan, tasks, [survey.findings, plan.findings], survey.points, world)
 
 
 @dataclass(frozen=True)

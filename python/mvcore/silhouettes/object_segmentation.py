@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,9 +153,37 @@ def find_standing(
         said["why"] = "the cameras do not stand all around"
         return None
     kinds = [_kinds(d, c, plane, bounds, tolerance) for d, c in zip(depths, cameras, strict=True)]
+    cut = _cut_views(images, cameras, kinds, bounds, config, carving, said)
+    if cut is None:
+        return None
+    masks, small = cut
+    hull = _common_hull(masks, small, bounds, carving)
+    shadows = _shadows(hull, small)
+    said["agreement"] = round(_agreement(masks, shadows), 3)
+    if said["agreement"] < config.min_agreement:
+        said["why"] = "the silhouettes disagree"
+        return None
+    # What the others rule out is not the target; a view that shows nothing takes what they have.
+    masks = [m & w if m.any() else s for m, s, w in zip(masks, shadows, _shadows(hull, small, 2.0), strict=True)]
+    said["silhouettes"] = True
+    return Standing([_enlarged(m, c) for m, c in zip(masks, cameras, strict=True)], plane, bounds, tolerance)
+
+
+def _cut_views(
+    images: Sequence[Image],
+    cameras: Sequence[Camera],
+    kinds: Sequence[Mask],
+    bounds: Bounds,
+    config: StandingConfig,
+    carving: CarveConfig,
+    said: dict[str, Any],
+) -> tuple[list[Mask], list[Camera]] | None:
+    """Silhouettes of reduced views with their cameras; None, and why, where depth maps do without or nothing is shown.
+
+    The smaller size is a quick look: what most views show there tells the others where to look.
+    """
     masks: list[Mask] = []
     small: list[Camera] = []
-    # The smaller size is a quick look: what most views show there tells the others where to look.
     for side in (config.look_size, config.max_size):
         views = [_seeds(*v, side) for v in zip(images, cameras, kinds, strict=True)]
         looks = _looks(masks, _shadows(_common_hull(masks, small, bounds, carving), small)) if masks else []
@@ -170,16 +199,7 @@ def find_standing(
         if said["measured"] > config.max_measured:
             said["why"] = "the depth maps show most of it"
             return None
-    hull = _common_hull(masks, small, bounds, carving)
-    shadows = _shadows(hull, small)
-    said["agreement"] = round(_agreement(masks, shadows), 3)
-    if said["agreement"] < config.min_agreement:
-        said["why"] = "the silhouettes disagree"
-        return None
-    # What the others rule out is not the target; a view that shows nothing takes what they have.
-    masks = [m & w if m.any() else s for m, s, w in zip(masks, shadows, _shadows(hull, small, 2.0), strict=True)]
-    said["silhouettes"] = True
-    return Standing([_enlarged(m, c) for m, c in zip(masks, cameras, strict=True)], plane, bounds, tolerance)
+    return masks, small
 
 
 def _points(view: DepthMap | None, camera: Camera, step: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

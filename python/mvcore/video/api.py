@@ -106,18 +106,27 @@ def reconstruct_video(
     ReconstructionError
         Nothing moves and no masks are given, or the calibration does not fit.
     """
-    require(isinstance(clips, Clips), "clips", "what mvcore.load_video returns", type(clips).__name__)
-    require(target in ("free", "rigid"), "target", "free or rigid", repr(target))
     require(executor is None or scheduler is None, "executor, scheduler", "one of them", "both")
-    config = config if isinstance(config, Config) else Config.from_dict(config or {})
+    settings = config if isinstance(config, Config) else Config.from_dict(config or {})
+    job = _job(clips, calib, masks, background, regions, bounds, settings)
+    require(target in ("free", "rigid"), "target", "free or rigid", repr(target))
+    require(target == "free" or not job.whole, "background", "a target for target='rigid'", "False: the whole scene")
+    names = [c.name for c in job.clips.clips]
+    run = VideoReconstruction(job.clips.times, names, list(job.clips.warnings), iter(()))
+    clip_run = ClipRun(job, run, target == "rigid", executor, scheduler, workdir, max_memory, track or no_track)
+    run._instants = clip_run.frames()
+    return run
+
+
+def _job(clips: Any, calib: Any, masks: Any, background: Any, regions: Any, bounds: ArrayLike | None, config: Config) -> Job:
+    """What a caller asks for, checked, in the local frame."""
+    require(isinstance(clips, Clips), "clips", "what mvcore.load_video returns", type(clips).__name__)
     if calib is not None:
         clips = with_calibration(clips, calib)
     clips.calib.check_baselines()
-    names = [c.name for c in clips.clips]
-    plates = [None] * len(names) if background is False else _plates(clips, background)
-    frame = LocalFrame.of(list(clips.calib))
-    box = check_bounds(bounds)
-    job = Job(
+    plates = [None] * len(clips.clips) if background is False else _plates(clips, background)
+    frame, box = LocalFrame.of(list(clips.calib)), check_bounds(bounds)
+    return Job(
         clips,
         None if masks is None else _mask_clips(masks, clips),
         plates,
@@ -127,12 +136,6 @@ def reconstruct_video(
         config,
         frame,
     )
-    if target == "rigid":
-        require(not job.whole, "background", "a target for target='rigid'", "False: the whole scene")
-    run = VideoReconstruction(clips.times, names, list(clips.warnings), iter(()))
-    clip_run = ClipRun(job, run, target == "rigid", executor, scheduler, workdir, max_memory, track or no_track)
-    run._instants = clip_run.frames()
-    return run
 
 
 def with_calibration(clips: Clips, calib: Calibration | Sequence[Camera] | str | Path) -> Clips:
