@@ -20,7 +20,7 @@ from ..pipeline.result import Reconstruction
 INDEX = "index.json"
 PICTURE = 480
 """Pixels of the longer side of depth pictures."""
-_TIMED = ("seconds", "peak_memory_mib")
+_TIMED = ("seconds", "tasks", "peak_memory_mib")
 """What differs from run to run stays out of the files: equal input gives equal bytes."""
 
 
