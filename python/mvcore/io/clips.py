@@ -18,7 +18,8 @@ from ..types import Image
 from .formats.detect import load
 from .formats.records import image_size
 from .images import read_image, undistort
-from .media import VIDEO_SUFFIXES, frame_files, natural_order, plate_in, probe, video_frame
+from .media import VIDEO_SUFFIXES, frame_files, plate_in, probe, video_frame
+from .pairing import natural_order
 
 Source = str | Path | Sequence[str | Path] | NDArray[np.uint8]
 """A video file, a folder of images, their paths in order, or an array (frames, h, w, 3)."""

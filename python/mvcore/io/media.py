@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import cv2
 from ..errors import FormatError
 from ..types import Image
 from .formats.records import IMAGE_SUFFIXES, image_size
+from .pairing import natural_order
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 PLATES = ("background", "clean", "plate", "empty")
@@ -27,11 +27,6 @@ class Media:
     height: int
     frames: int
     rate: float
-
-
-def natural_order(path: Path) -> list[tuple[int, str]]:
-    """A key under which ``frame10`` comes after ``frame9``."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def frame_files(folder: Path) -> list[Path]:

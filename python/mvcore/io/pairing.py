@@ -1,0 +1,147 @@
+"""Pairing of files with views or clips by name, in natural order (``frame10`` after ``frame9``)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePath
+
+from ..errors import FormatError
+
+Key = Callable[[PurePath], object]
+
+
+def natural_order(path: PurePath) -> list[tuple[int, str]]:
+    """A key under which ``frame10`` comes after ``frame9``."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part.casefold()) for part in parts]
+
+
+def pair_by_name(
+    names: Sequence[str | PurePath],
+    candidates: Sequence[Path],
+    what: str,
+    *,
+    partial: bool = False,
+    by_order: bool = True,
+) -> list[Path | None]:
+    """The file that belongs to each name.
+
+    The strictest of these comparisons that pairs the most decides, for all names together: equal names; without
+    suffix; without suffix and case; the numbers in the name (``mask_2`` with ``v02``). Among files of one name in
+    several folders, the folders' names decide. If nothing pairs and there are as many files as names, both are taken
+    in natural order.
+
+    Parameters
+    ----------
+    names : of views, cameras or frames; paths may have folders and suffixes.
+    candidates : files (or folders) to choose from; more than names are allowed, except for pairing by order.
+    what : one such file, for messages: ``"mask"``.
+    partial : names without a file are allowed and give None, as long as one has a file.
+    by_order : whether natural order may decide where names pair nothing.
+
+    Returns
+    -------
+    list[Path | None]
+        One a name; no file twice.
+
+    Raises
+    ------
+    FormatError
+        A name that fits two files, two names that fit one, or names that fit only partly.
+
+    Examples
+    --------
+    >>> files = [Path("mask_10.png"), Path("mask_2.png")]
+    >>> [str(p) for p in pair_by_name(["v02.jpg", "v10.jpg"], files, "mask")]
+    ['mask_2.png', 'mask_10.png']
+    """
+    wanted = [PurePath(n) for n in names]
+    files = sorted(candidates, key=lambda p: (natural_order(p.parent), natural_order(p)))
+    if not wanted or not files:
+        return _whole(wanted, files, [None] * len(wanted), what, partial)
+    best: list[Path | None] = [None] * len(wanted)
+    clash = ""
+    for key in _KEYS:
+        pairs, problem = _match(wanted, files, key, what)
+        if _paired(pairs) == len(pairs) > 0:
+            return pairs
+        clash = clash or problem
+        if _paired(pairs) > _paired(best) and (key is not _numbers or _paired(pairs) == len(files)):
+            best = pairs
+    if clash:
+        raise FormatError(clash)
+    if _paired(best):
+        return _whole(wanted, files, best, what, partial)
+    if by_order and len(files) == len(wanted):
+        order = sorted(range(len(wanted)), key=lambda n: (natural_order(wanted[n].parent), natural_order(wanted[n])))
+        ordered: list[Path | None] = [None] * len(wanted)
+        for file, n in zip(files, order, strict=True):
+            ordered[n] = file
+        return ordered
+    return _whole(wanted, files, [None] * len(wanted), what, partial)
+
+
+def _paired(pairs: Sequence[Path | None]) -> int:
+    return sum(p is not None for p in pairs)
+
+
+def _match(names: Sequence[PurePath], files: Sequence[Path], key: Key, what: str) -> tuple[list[Path | None], str]:
+    """The pairs under a key, or what makes them ambiguous."""
+    table: dict[object, list[Path]] = {}
+    for file in files:
+        table.setdefault(key(file), []).append(file)
+    pairs: list[Path | None] = []
+    taken: dict[Path, PurePath] = {}
+    for name in names:
+        k = key(name)
+        options = table.get(k, []) if k else []
+        if len(options) > 1:  # the same name in several folders: the folders' names decide
+            options = _closest(name, options)
+        if len(options) > 1:
+            return [], f"{name}: expected one {what}, got {options[0]} and {options[1]}"
+        if options and options[0] in taken:
+            return [], f"{options[0]}: belongs to both {taken[options[0]]} and {name}, expected one {what} each"
+        if options:
+            taken[options[0]] = name
+        pairs.append(options[0] if options else None)
+    return pairs, ""
+
+
+def _closest(name: PurePath, files: Sequence[Path]) -> list[Path]:
+    """The files that share the most folders with a name."""
+    folders = [p.casefold() for p in name.parent.parts]
+
+    def shared(file: Path) -> int:
+        theirs = [p.casefold() for p in file.parent.parts]
+        count = 0
+        while count < min(len(folders), len(theirs)) and folders[-1 - count] == theirs[-1 - count]:
+            count += 1
+        return count
+
+    most = max(map(shared, files))
+    return [f for f in files if shared(f) == most]
+
+
+def _stem(path: PurePath) -> str:
+    """The name without suffixes that name a file's kind: ``a.jpg.png`` is ``a``, ``v1.2`` stays."""
+    name = path.name
+    while (match := re.fullmatch(r"(.+)\.([A-Za-z][A-Za-z0-9]{1,4})", name)) is not None:
+        name = match.group(1)
+    return name
+
+
+def _numbers(path: PurePath) -> tuple[int, ...]:
+    return tuple(int(d) for d in re.findall(r"\d+", _stem(path)))
+
+
+_KEYS: tuple[Key, ...] = (lambda p: p.name, _stem, lambda p: _stem(p).casefold(), _numbers)
+
+
+def _whole(names: Sequence[PurePath], files: Sequence[Path], pairs: list[Path | None], what: str, partial: bool) -> list[Path | None]:
+    missing = [str(n) for n, p in zip(names, pairs, strict=True) if p is None]
+    if not missing or (partial and len(missing) < len(pairs)):
+        return pairs
+    extra = [f.name for f in files if f not in set(pairs)]
+    rest = f"; {', '.join(extra[:3])} {'belongs' if len(extra) == 1 else 'belong'} to none" if extra else ""
+    raise FormatError(f"no {what} for {missing[0]} ({len(missing)} of {len(names)} have none){rest}")
