@@ -37,14 +37,15 @@ def test_names_that_fit_partly_are_refused_or_left_out():
     with pytest.raises(FormatError, match=r"no mask for top \(1 of 3 have none\); rear.mp4 belongs to none"):
         paired(["left", "right", "top"], ["left.mp4", "rear.mp4", "right.mp4"])
     assert paired(["a.jpg", "b.jpg", "c.jpg"], ["c.png", "a.png"], partial=True) == ["a.png", None, "c.png"]
+    assert paired(["c0/1.jpg", "c1/1.jpg"], ["m/c1/1.jpg"], partial=True) == [None, "m/c1/1.jpg"]
     with pytest.raises(FormatError, match="3 of 3 have none"):
         paired(["a", "b", "c"], ["x.png", "y.png"], partial=True)
     with pytest.raises(FormatError, match="2 of 2 have none"):
-        paired(["a", "b"], ["x.png", "y.png"], by_order=False)
+        paired(["a", "b"], ["x.png", "y.png"], exact=True)
 
 
 def test_two_files_for_one_name_are_refused():
     with pytest.raises(FormatError, match=r"left: expected one mask, got left.avi and left.mp4"):
         paired(["left", "right"], ["left.mp4", "left.avi", "right.mp4"])
     with pytest.raises(FormatError, match="belongs to both"):
-        paired(["a/1.jpg", "b/1.jpg"], ["1.png", "2.png"])
+        paired(["v1.jpg", "v01.jpg"], ["1.png", "2.png", "3.png"])

@@ -19,25 +19,59 @@ Float = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R Rᵀ from the identity: calibration files are often rounded to four digits."""
+EXACT = 1e-14
+"""The same deviation of a rotation that only float64 rounded."""
 
 
 def euler_to_rotation(x: float, y: float, z: float) -> Float:
-    """R = Rx · Ry · Rz from angles in radians (paper eqs 2-5), shape (3, 3)."""
+    """R = Rx · Ry · Rz from angles in radians, shape (3, 3), with the matrices as the paper prints them.
+
+    Eqs 2-5: world axes turn by the angles, so coordinates turn against them (``Rx`` has +sin above the diagonal).
+
+    Examples
+    --------
+    >>> euler_to_rotation(np.pi / 2, 0, 0).round(12) + 0.0
+    array([[ 1.,  0.,  0.],
+           [ 0.,  0.,  1.],
+           [ 0., -1.,  0.]])
+    """
     cx, cy, cz = np.cos([x, y, z])
     sx, sy, sz = np.sin([x, y, z])
-    rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    rx = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    ry = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    rz = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
     return rx @ ry @ rz
 
 
 def rotation_to_euler(rotation: ArrayLike) -> tuple[float, float, float]:
     """Angles (x, y, z) in radians with ``euler_to_rotation(x, y, z) == rotation``; z = 0 at gimbal lock (y = ±90°)."""
     r = np.asarray(rotation, np.float64)
-    y = float(np.arctan2(r[0, 2], np.hypot(r[0, 0], r[0, 1])))
+    y = float(np.arctan2(-r[0, 2], np.hypot(r[0, 0], r[0, 1])))
     if np.hypot(r[0, 0], r[0, 1]) < 1e-9:
-        return float(np.arctan2(r[1, 0], r[1, 1])), y, 0.0
-    return float(np.arctan2(-r[1, 2], r[2, 2])), y, float(np.arctan2(-r[0, 1], r[0, 0]))
+        return float(np.arctan2(-r[2, 1], r[1, 1])), y, 0.0
+    return float(np.arctan2(r[1, 2], r[2, 2])), y, float(np.arctan2(r[0, 1], r[0, 0]))
+
+
+def rotation_from(matrix: ArrayLike, name: str = "R") -> Float:
+    """The rotation nearest to a matrix that is one but for rounding, (3, 3) float64.
+
+    Calibration files are often rounded to four digits. Far from the origin (UTM, ECEF) the error of such an R times the
+    centre is metres: readers of formats that store the centre C need the rotation itself before t = -R C.
+
+    Raises
+    ------
+    InvalidInputError
+        A matrix that is off by more than `ROTATION_TOLERANCE`, or a reflection.
+    """
+    r = _matrix(name, matrix, (3, 3))
+    off = np.abs(r @ r.T - np.eye(3)).max()
+    require(off < ROTATION_TOLERANCE, name, "a rotation (R Rᵀ = 1)", f"a deviation of {off:.3g}")
+    det = np.linalg.det(r)
+    require(det > 0, name, "a rotation", f"a reflection (det {det:.3g})")
+    if off <= EXACT:
+        return r
+    u, _, v = np.linalg.svd(r)
+    return u @ v
 
 
 def _matrix(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float:
@@ -60,11 +94,11 @@ class Camera:
     Parameters
     ----------
     K : (3, 3) float64, pixels. Upper triangular, K[2, 2] = 1.
-    R : (3, 3) float64. World to camera.
-    t : (3,) float64, world units. World to camera.
+    R : (3, 3) float64. World to camera. A matrix rounded to a few digits is replaced by the nearest rotation.
+    t : (3,) float64, world units. World to camera. Where R is replaced, t follows, so that the centre -R⁻¹ t stays.
     width, height : image size in pixels.
     distortion : OpenCV coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), or four fisheye ones; empty for a pinhole.
-    fisheye : the coefficients are OpenCV's fisheye (equidistant) model.
+    fisheye : the projection is OpenCV's fisheye (equidistant) model, also where all four coefficients are zero.
     name : what the files call the view.
 
     Raises
@@ -94,15 +128,20 @@ class Camera:
         require(k[0, 0] > 0 and k[1, 1] > 0, who + "K", "positive focal lengths", f"{k[0, 0]:g}, {k[1, 1]:g}")
         lower = np.abs([k[1, 0], k[2, 0], k[2, 1]]).max()
         require(lower < 1e-6 and abs(k[2, 2] - 1) < 1e-6, who + "K", "an upper triangular matrix with K[2, 2] = 1", k.tolist())
-        off = np.abs(r @ r.T - np.eye(3)).max()
-        require(off < ROTATION_TOLERANCE, who + "R", "a rotation (R Rᵀ = 1)", f"a deviation of {off:.3g}")
-        require(np.linalg.det(r) > 0, who + "R", "a rotation", f"a reflection (det {np.linalg.det(r):.3g})")
+        rotation = rotation_from(r, who + "R")
+        if rotation is not r:
+            t = rotation @ np.linalg.solve(r, t)
         require(self.width > 0 and self.height > 0, who + "size", "positive width and height", f"{self.width} x {self.height}")
         d = np.array(self.distortion, np.float64).reshape(-1)
         sizes = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
         require(d.size in sizes, who + "distortion", f"{' or '.join(map(str, sizes))} coefficients", d.size)
         require(np.isfinite(d).all(), who + "distortion", "finite numbers", "NaN or infinity")
-        for key, value in {"K": k, "R": r, "t": t, "distortion": d, "width": int(self.width), "height": int(self.height)}.items():
+        if self.fisheye and not d.size:
+            d = np.zeros(4)
+        values = {"K": k, "R": rotation, "t": t, "distortion": d, "width": int(self.width), "height": int(self.height)}
+        for key, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
             object.__setattr__(self, key, value)
 
     @classmethod
@@ -126,6 +165,13 @@ class Camera:
         return cls(K=k / k[2, 2], R=rotation, t=t, width=width, height=height, **more)
 
     @classmethod
+    def from_center(cls, K: ArrayLike, R: ArrayLike, center: ArrayLike, width: int, height: int, **more: Any) -> Camera:
+        """From the camera's centre in the world, (3,), in place of t: t = -R C with R's nearest rotation."""
+        rotation = rotation_from(R)
+        t = -rotation @ _matrix("center", center, (3,))
+        return cls(K=np.asarray(K), R=rotation, t=t, width=width, height=height, **more)
+
+    @classmethod
     def from_euler(cls, K: ArrayLike, angles: ArrayLike, t: ArrayLike, width: int, height: int, **more: Any) -> Camera:
         """From Euler angles (x, y, z) in radians, R = Rx · Ry · Rz (paper eqs 2-5), and t (eq 6)."""
         x, y, z = _matrix("angles", angles, (3,))
@@ -135,6 +181,11 @@ class Camera:
     def center(self) -> Float:
         """Camera centre in the world, shape (3,)."""
         return -self.R.T @ self.t
+
+    @property
+    def distorted(self) -> bool:
+        """Whether its images must be undistorted: a fisheye, or any coefficient that is not zero."""
+        return self.fisheye or bool(self.distortion.any())
 
     @property
     def axis(self) -> Float:

@@ -23,14 +23,13 @@ def pair_by_name(
     what: str,
     *,
     partial: bool = False,
-    by_order: bool = True,
+    exact: bool = False,
 ) -> list[Path | None]:
     """The file that belongs to each name.
 
     The strictest of these comparisons that pairs the most decides, for all names together: equal names; without
-    suffix; without suffix and case; the numbers in the name (``mask_2`` with ``v02``). Among files of one name in
-    several folders, the folders' names decide. If nothing pairs and there are as many files as names, both are taken
-    in natural order.
+    suffix; without suffix and case; the numbers in the name (``mask_2`` with ``v02``). Folders count where names are
+    equal without them. If nothing pairs and there are as many files as names, both are taken in natural order.
 
     Parameters
     ----------
@@ -38,7 +37,7 @@ def pair_by_name(
     candidates : files (or folders) to choose from; more than names are allowed, except for pairing by order.
     what : one such file, for messages: ``"mask"``.
     partial : names without a file are allowed and give None, as long as one has a file.
-    by_order : whether natural order may decide where names pair nothing.
+    exact : names alone decide, neither the numbers in them nor their order.
 
     Returns
     -------
@@ -62,7 +61,7 @@ def pair_by_name(
         return _whole(wanted, files, [None] * len(wanted), what, partial)
     best: list[Path | None] = [None] * len(wanted)
     clash = ""
-    for key in _KEYS:
+    for key in _KEYS[:-1] if exact else _KEYS:
         pairs, problem = _match(wanted, files, key, what)
         if _paired(pairs) == len(pairs) > 0:
             return pairs
@@ -73,7 +72,7 @@ def pair_by_name(
         raise FormatError(clash)
     if _paired(best):
         return _whole(wanted, files, best, what, partial)
-    if by_order and len(files) == len(wanted):
+    if not exact and len(files) == len(wanted):
         order = sorted(range(len(wanted)), key=lambda n: (natural_order(wanted[n].parent), natural_order(wanted[n])))
         ordered: list[Path | None] = [None] * len(wanted)
         for file, n in zip(files, order, strict=True):
@@ -88,15 +87,15 @@ def _paired(pairs: Sequence[Path | None]) -> int:
 
 def _match(names: Sequence[PurePath], files: Sequence[Path], key: Key, what: str) -> tuple[list[Path | None], str]:
     """The pairs under a key, or what makes them ambiguous."""
+    folders = _folders(names)
     table: dict[object, list[Path]] = {}
     for file in files:
-        table.setdefault(key(file), []).append(file)
+        table.setdefault(_full(file, key, folders), []).append(file)
     pairs: list[Path | None] = []
     taken: dict[Path, PurePath] = {}
     for name in names:
-        k = key(name)
-        options = table.get(k, []) if k else []
-        if len(options) > 1:  # the same name in several folders: the folders' names decide
+        options = table.get(_full(name, key, folders), []) if key(name) else []
+        if len(options) > 1:
             options = _closest(name, options)
         if len(options) > 1:
             return [], f"{name}: expected one {what}, got {options[0]} and {options[1]}"
@@ -106,6 +105,16 @@ def _match(names: Sequence[PurePath], files: Sequence[Path], key: Key, what: str
             taken[options[0]] = name
         pairs.append(options[0] if options else None)
     return pairs, ""
+
+
+def _folders(names: Sequence[PurePath]) -> int:
+    """How many folders it takes to tell names apart."""
+    deepest = max(len(n.parts) for n in names)
+    return next((d for d in range(deepest) if len({n.parts[-1 - d :] for n in names}) == len(names)), deepest - 1)
+
+
+def _full(path: PurePath, key: Key, folders: int) -> tuple[object, ...]:
+    return (*(p.casefold() for p in path.parts[:-1][len(path.parts) - 1 - folders :]), key(path)) if folders else (key(path),)
 
 
 def _closest(name: PurePath, files: Sequence[Path]) -> list[Path]:

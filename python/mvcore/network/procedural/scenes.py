@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import _core
-from ...geometry.cameras import Camera, euler_to_rotation
+from ...geometry.cameras import Camera
 from .photometry import through_a_camera
-from .shapes import Shape, ground, random_rotation, random_shape, wall
+from .shapes import Shape, ground, random_rotation, random_shape, turned, wall
 from .textures import SIDE, random_tile
 
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ def _towards(center: Array, target: Array, roll: float) -> Array:
     z = (target - center) / np.linalg.norm(target - center)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= max(np.linalg.norm(x), 1e-9)
-    return euler_to_rotation(0, 0, roll) @ np.stack([x, np.cross(z, x), z])
+    return turned(0, 0, roll) @ np.stack([x, np.cross(z, x), z])
 
 
 def _stage(random: Random, focal: float, size: tuple[int, int], near: float, far: float, held_out: bool, floating: bool) -> list[Shape]:
@@ -88,13 +88,13 @@ def _stage(random: Random, focal: float, size: tuple[int, int], near: float, far
         shapes.append(random_shape(random, held_out).placed(radius * stretch, random_rotation(random), np.array([*middle, depth])))
     if random.random() < 0.6:
         flat = wall(12 * far, 12 * far, (random.uniform(20, 200),) * 2)
-        turn = euler_to_rotation(np.pi / 2 + random.normal(0, 0.06), 0, random.normal(0, 0.06))
+        turn = turned(np.pi / 2 + random.normal(0, 0.06), 0, random.normal(0, 0.06))
         shapes.append(flat.placed(1.0, turn, np.array([0, random.uniform(0.3, 1.2) * half[1] * far, far])))
     back = far * random.uniform(1.05, 2.0)
-    tilt = euler_to_rotation(random.normal(0, 0.25), random.normal(0, 0.4), 0)
+    tilt = turned(random.normal(0, 0.25), random.normal(0, 0.4), 0)
     shapes.append(wall(14 * far, 14 * far, (random.uniform(14, 160),) * 2).placed(1.0, tilt, np.array([0, 0, back])))
     if random.random() < 0.5:
-        side = euler_to_rotation(0, np.pi / 2 + random.normal(0, 0.15), 0)
+        side = turned(0, np.pi / 2 + random.normal(0, 0.15), 0)
         x = random.choice([-1, 1]) * half[0] * far * random.uniform(0.4, 1.1)
         shapes.append(wall(10 * far, 10 * far, (random.uniform(10, 100),) * 2).placed(1.0, side, np.array([x, 0, far])))
     return shapes
@@ -205,11 +205,11 @@ def _standing(random: Random, focal: float, size: tuple[int, int], held_out: boo
         scale = radius * random.uniform(0.1, 0.7, 3)
         place = floor + away * (np.array([np.cos(angle), np.sin(angle)]) @ across) + up * scale.min()
         shapes.append(random_shape(random, held_out).placed(scale, random_rotation(random), place))
-    upright = euler_to_rotation(np.pi / 2 + pitch, 0, 0)
+    upright = turned(np.pi / 2 + pitch, 0, 0)
     side = 30 * distance
     shapes.append(ground(side, random.uniform(20, 300)).placed(1.0, upright, floor))
     for _ in range(int(random.integers(1, 4))):
-        turn = euler_to_rotation(pitch, 0, 0) @ euler_to_rotation(0, random.uniform(-np.pi, np.pi), 0)
+        turn = turned(pitch, 0, 0) @ turned(0, random.uniform(-np.pi, np.pi), 0)
         away = max(6 * radius, distance * random.uniform(1.3, 4.0))
         shapes.append(wall(side, side, (random.uniform(14, 160),) * 2).placed(1.0, turn, target + turn[:, 2] * away))
     return _Scenery(shapes, target, up)

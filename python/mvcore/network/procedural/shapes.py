@@ -172,6 +172,11 @@ def random_shape(random: Random, held_out: bool) -> Shape:
     return families[random.integers(len(families))](random)
 
 
+def turned(x: float, y: float, z: float) -> Array:
+    """The matrix that turns points by right-handed angles about z, then y, then x (the paper's matrices turn the axes)."""
+    return euler_to_rotation(-x, -y, -z)
+
+
 def random_rotation(random: Random) -> Array:
     """A turn about random Euler angles."""
-    return euler_to_rotation(*random.uniform(-np.pi, np.pi, 3))
+    return turned(*random.uniform(-np.pi, np.pi, 3))
