@@ -87,6 +87,12 @@ def _matrix(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float:
     return array
 
 
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) can be the same picture at two scales, each side rounded to a whole pixel."""
+    (w, h), (a, b) = sorted((size, other))
+    return abs(w * b / a - h) <= 1 or abs(h * a / b - w) <= 1
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """One calibrated view.
@@ -129,7 +135,7 @@ class Camera:
         lower = np.abs([k[1, 0], k[2, 0], k[2, 1]]).max()
         require(lower < 1e-6 and abs(k[2, 2] - 1) < 1e-6, who + "K", "an upper triangular matrix with K[2, 2] = 1", k.tolist())
         rotation = rotation_from(r, who + "R")
-        if rotation is not r:
+        if not np.array_equal(rotation, r):
             t = rotation @ np.linalg.solve(r, t)
         require(self.width > 0 and self.height > 0, who + "size", "positive width and height", f"{self.width} x {self.height}")
         d = np.array(self.distortion, np.float64).reshape(-1)
@@ -251,6 +257,8 @@ class Camera:
 class Calibration(Sequence[Camera]):
     """The cameras of a rig or of a set of photographs, in the order of the frames.
 
+    ``mirrored``: the caller's world is left-handed; the cameras are those of its reflection in z (`Scene.mirror`).
+
     Raises
     ------
     InvalidInputError
@@ -259,6 +267,7 @@ class Calibration(Sequence[Camera]):
 
     cameras: tuple[Camera, ...]
     source: str = ""
+    mirrored: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(self.cameras))

@@ -8,7 +8,6 @@ P is left-handed: a turntable whose axis points the other way. Such a world is r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,11 +54,6 @@ def cameras_from_projections(
     if not _mirrored(cameras, matrices):
         return cameras, False
     return [Camera.from_projection(np.asarray(p, np.float64) @ MIRROR, *size, name=name) for p, size, name in views], True
-
-
-def reflected(camera: Camera) -> Camera:
-    """A camera whose R is a rotation but for z, brought to the reflected world and back: x ~ K (R S X' + t)."""
-    return replace(camera, R=camera.R @ MIRROR[:3, :3])
 
 
 def _mirrored(cameras: Sequence[Camera], matrices: Sequence[ArrayLike]) -> bool:

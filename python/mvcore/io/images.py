@@ -4,60 +4,97 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FormatError, InvalidInputError, require
-from ..geometry.cameras import Camera
+from ..geometry.cameras import Camera, same_shape
 from ..types import Frame, Image
-from .formats.records import IMAGE_SUFFIXES, find_mask
+from .decode import decode, eight_bits, read_header, turn
+from .formats.places import IMAGE_SUFFIXES, images_below
+from .pairing import pair_by_name
+
+LABELS = 64
+"""Most values of a label image; a soft mask has more."""
+FEW = 8
+"""Values of an image that surely holds labels, also where some are close to 0."""
+BETWEEN = 0.05
+"""Share of a mask's non-zero pixels between dark and bright from which it is a label image rather than a soft mask."""
+NOISE = 32
+"""Grey levels that JPEG adds to a black mask, of 255."""
+INVERTED = 0.15
+"""By how much the border must exceed the inside, as shares of target pixels, for a mask to look inverted."""
 
 
 def read_image(path: str | Path) -> Image:
-    """(h, w, 3) uint8 RGB; EXIF orientation is not applied, as calibrations do not know it."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image")
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise FormatError(f"{path}: not an image that OpenCV reads")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    """(h, w, 3) uint8 RGB of a grey, colour, 16-bit or float image; black where it is transparent.
 
-
-def read_mask(path: str | Path) -> NDArray[np.uint8]:
-    """(h, w) uint8, 255 on the target: where the file is brighter than half."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such mask")
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise FormatError(f"{path}: not an image that OpenCV reads")
-    if image.ndim == 3:
-        image = image[..., 3] if image.shape[2] == 4 else image.max(2)
-    return np.where(image > np.iinfo(image.dtype).max // 2, 255, 0).astype(np.uint8)
-
-
-def find_masks(folder: str | Path, frames: Sequence[Frame]) -> list[Path]:
-    """The mask file of each frame in a folder.
+    More than eight bits are scaled alike for all images of a folder (`eight_bits`). EXIF orientation is not applied, as
+    calibrations do not know it; `load_frame` does where the camera's size says so.
 
     Raises
     ------
-    FormatError
-        A frame without one.
+    FileNotFoundError, FormatError
+        No such file, or none that can be read.
+    """
+    array = decode(path)
+    image = eight_bits(path, array[..., :3] if array.ndim == 3 else array)
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, 2)
+    if array.shape[2] == 4:
+        image = np.where(array[..., 3:] > 0, image, 0).astype(np.uint8)
+    return np.ascontiguousarray(image)
+
+
+def read_mask(path: str | Path) -> NDArray[np.uint8]:
+    """(h, w) uint8, 255 on the target: its alpha if that is transparent somewhere, else what is bright or has a label.
+
+    Masks of two values (0 and 1, 0 and 255, 16-bit) and soft masks count as target above half of their largest value; label
+    images (few values, many of them in between) where the label is not 0.
+    """
+    array = decode(path)
+    if array.ndim == 3:
+        opaque = array.shape[2] < 4 or (array[..., 3] == array[..., 3].max(initial=0)).all()
+        array = array[..., :3].max(2) if opaque else array[..., 3]
+    lossy = Path(path).suffix.lower() in (".jpg", ".jpeg", ".webp")
+    return np.where(_target(array, lossy), 255, 0).astype(np.uint8)
+
+
+def _target(mask: NDArray[Any], lossy: bool = False) -> NDArray[np.bool_]:
+    most = float(mask.max(initial=0))
+    if not most > 0 or (lossy and mask.dtype == np.uint8 and most < NOISE):
+        return np.zeros(mask.shape, bool)
+    inside = mask > 0
+    values = len(np.unique(mask))
+    edge = most / 8
+    between = inside & (mask < most - edge) & ((mask > edge) | (values <= FEW))
+    if not lossy and values <= LABELS and between.sum() > BETWEEN * inside.sum():
+        return inside
+    return mask > most / 2
+
+
+def find_masks(folder: str | Path, frames: Sequence[Frame]) -> list[Path | None]:
+    """The mask file of each frame in a folder, by name (`pair_by_name`); None for frames without one.
+
+    Raises
+    ------
+    FileNotFoundError, FormatError
+        No such folder, no mask for any frame, or names that are ambiguous.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of masks")
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in (".png", ".jpg", ".bmp", ".tif"))
-    found: list[Path | None] = [find_mask(folder, Path(f)) if isinstance(f, str | Path) else None for f in frames]
-    if all(f is None for f in found) and len(files) == len(frames):
-        return files  # named otherwise, but one a frame: taken in order
-    missing = [str(frame) for frame, mask in zip(frames, found, strict=True) if mask is None]
-    if missing:
-        raise FormatError(f"{folder}: no mask for {missing[0]} ({len(missing)} of {len(frames)} frames have none)")
-    return [f for f in found if f is not None]
+    names = [f if isinstance(f, str | Path) else f"{n:06d}" for n, f in enumerate(frames)]
+    files = images_below(folder)
+    if not files:
+        raise FormatError(f"{folder}: no mask for {names[0] if names else 'any frame'} (the folder holds no images)")
+    try:
+        return pair_by_name(names, files, "mask", partial=True)
+    except FormatError as error:
+        raise FormatError(f"{folder}: {error}") from None
 
 
 def find_pictures(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
@@ -82,7 +119,7 @@ def find_pictures(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def load_frame(frame: Frame, camera: Camera, index: int) -> Image:
-    """A frame as an image of its camera's size.
+    """A frame as an image of its camera's size; a file's EXIF turn is applied where only then the size fits.
 
     Raises
     ------
@@ -91,7 +128,7 @@ def load_frame(frame: Frame, camera: Camera, index: int) -> Image:
     """
     name = f"frames[{index}]"
     if isinstance(frame, str | Path):
-        image = read_image(frame)
+        image = _turned(read_image(frame), frame, camera)
         name = f"{name} ({Path(frame).name})"
     else:
         image = np.asarray(frame)
@@ -103,31 +140,91 @@ def load_frame(frame: Frame, camera: Camera, index: int) -> Image:
     return np.ascontiguousarray(image)
 
 
-def load_mask(mask: Frame, camera: Camera, index: int) -> NDArray[np.uint8]:
-    """A mask, (h, w) uint8 or bool or a path, as 0 and 255."""
+def load_mask(mask: Frame | None, camera: Camera, index: int) -> NDArray[np.uint8]:
+    """A mask, (h, w) uint8 or bool or a path, as 0 and 255 at its camera's size; all 255 for a view without one (None).
+
+    A mask of the same shape at another size is scaled.
+
+    Raises
+    ------
+    InvalidInputError
+        Another dtype, or a size of another shape than the camera's.
+    """
     name = f"masks[{index}]"
+    if mask is None:
+        return np.full((camera.height, camera.width), 255, np.uint8)
     if isinstance(mask, str | Path):
-        array = read_mask(mask)
+        name = f"{name} ({Path(mask).name})"
+        array = _turned(read_mask(mask), mask, camera)
     else:
-        given = np.asarray(mask)
-        require(
-            given.ndim == 2 and given.dtype in (np.uint8, np.bool_),
-            name,
-            "(h, w) of uint8 or bool",
-            f"{given.shape} of {given.dtype}",
-        )
-        array = np.where(given > (0 if given.dtype == np.bool_ or given.max(initial=0) <= 1 else 127), 255, 0).astype(np.uint8)
-    require(array.shape == (camera.height, camera.width), name, f"shape {(camera.height, camera.width)}", array.shape)
-    return array
+        values = np.asarray(mask)
+        good = values.ndim == 2 and values.dtype in (np.uint8, np.bool_)
+        require(good, name, "(h, w) of uint8 or bool", f"{values.shape} of {values.dtype}")
+        array = np.where(_target(values), 255, 0).astype(np.uint8)
+    height, width = array.shape
+    if (width, height) == (camera.width, camera.height):
+        return array
+    if not same_shape((width, height), (camera.width, camera.height)):
+        raise InvalidInputError(f"{name}: expected {camera.width} x {camera.height} pixels as its camera, got {width} x {height}")
+    method = cv2.INTER_AREA if width > camera.width else cv2.INTER_LINEAR
+    return np.where(cv2.resize(array, (camera.width, camera.height), interpolation=method) > 127, 255, 0).astype(np.uint8)
+
+
+def _turned(image: NDArray[np.uint8], path: str | Path, camera: Camera) -> NDArray[np.uint8]:
+    size = (image.shape[1], image.shape[0])
+    if size == (camera.width, camera.height) or size[::-1] != (camera.width, camera.height):
+        return image
+    return turn(image, read_header(path).orientation)
+
+
+def mask_warnings(masks: Sequence[NDArray[np.uint8] | None]) -> list[str]:
+    """What is suspicious about masks (255 on the target): views without one, empty ones, and ones that look inverted.
+
+    A target seldom fills the image's border more than its inside: if most masks do, they are bright where it is not.
+    """
+    messages = []
+    present = [(n, m > 127) for n, m in enumerate(masks) if m is not None]
+    if missing := [n for n, m in enumerate(masks) if m is None]:
+        messages.append(f"{len(missing)} of {len(masks)} views have no mask and are not cut ({_some(missing)})")
+    if empty := [n for n, m in present if not m.any()]:
+        messages.append(f"{len(empty)} of {len(masks)} masks are empty ({_some(empty)})")
+    excess = [_border(m) - float(m.mean()) for _, m in present if m.any()]
+    if excess and np.median(excess) > INVERTED:
+        messages.append("masks look inverted: they fill the images' borders more than their inside; the target must be bright")
+    return messages
+
+
+def _border(mask: NDArray[np.bool_]) -> float:
+    return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
+
+
+def _some(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:5])) + (" .." if len(numbers) > 5 else "")
+
+
+def distorted_pixels(camera: Camera, pixels: ArrayLike) -> NDArray[np.float64]:
+    """Where the lens shows what a pinhole with the same K shows at some pixels, (N, 2) to (N, 2); OpenCV's models."""
+    x = np.asarray(pixels, np.float64).reshape(-1, 2)
+    if not camera.distorted:
+        return x.copy()
+    rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(camera.K).T
+    project = cv2.fisheye.projectPoints if camera.fisheye else cv2.projectPoints
+    plane = project((rays / rays[:, 2:]).reshape(-1, 1, 3), np.zeros(3), np.zeros(3), np.eye(3), camera.distortion)[0]
+    return np.asarray(plane.reshape(-1, 2) @ camera.K[:2, :2].T + camera.K[:2, 2], np.float64)
 
 
 def undistort(image: NDArray[np.uint8], camera: Camera, nearest: bool = False) -> NDArray[np.uint8]:
     """The image that a pinhole with the same K would have taken (OpenCV); masks with ``nearest``."""
-    if not camera.distortion.size or not camera.distortion.any():
+    if not camera.distorted:
         return image
     size = (camera.width, camera.height)
     build = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
-    x, y = build(camera.K, camera.distortion, np.eye(3), camera.K, size, cv2.CV_32FC1)
+    k = camera.K
+    if k[0, 1]:  # OpenCV leaves skew out of the distorted side
+        x, y = build(np.eye(3), camera.distortion, np.eye(3), k, size, cv2.CV_32FC1)
+        x, y = (k[0, 0] * x + k[0, 1] * y + k[0, 2]).astype(np.float32), (k[1, 1] * y + k[1, 2]).astype(np.float32)
+    else:
+        x, y = build(k, camera.distortion, np.eye(3), k, size, cv2.CV_32FC1)
     return cv2.remap(image, x, y, cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
 
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry.cameras import Calibration
+from ..geometry.projections import MIRROR
 from ..types import Bounds, Frame
 
 
@@ -13,7 +17,15 @@ from ..types import Bounds, Frame
 class Scene:
     """What `mvcore.load` finds: frames with their cameras, and masks and bounds where the set has them.
 
-    ``masks[i]`` is the path of frame i's mask (or None); ``bounds`` is (2, 3) float64 or None.
+    frames : paths or images; after ``load(path, images=False)`` None where there is no file.
+    masks : the path of each frame's mask, None for a frame without; ``alpha`` says that they are the images' own alpha channels.
+    bounds : (2, 3) float64 or None.
+    format : what the calibration was read as.
+    warnings : what was assumed, scaled, or left out.
+
+    A calibration of a left-handed world (``mirrored``) is read into its reflection in z: ``calib`` and ``bounds`` are of the
+    reflected, right-handed world, and results go back to the caller's by ``mirror`` (X_caller = mirror X, with faces turned
+    round: their corners in reverse order). What the caller names in its own world (bounds) goes the same way in.
     """
 
     frames: Sequence[Frame]
@@ -21,6 +33,24 @@ class Scene:
     masks: Sequence[Frame | None] | None = None
     bounds: Bounds | None = None
     format: str = ""
+    warnings: tuple[str, ...] = ()
+    alpha: bool = False
 
     def __len__(self) -> int:
         return len(self.calib)
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the caller's world is left-handed."""
+        return self.calib.mirrored
+
+    @property
+    def mirror(self) -> NDArray[np.float64] | None:
+        """X_caller = mirror X, (4, 4), its own inverse; None where the world is not mirrored."""
+        return MIRROR.copy() if self.mirrored else None
+
+    def subset(self, numbers: Sequence[int]) -> Scene:
+        """The scene of some views, in the order of the numbers."""
+        calib = replace(self.calib, cameras=tuple(self.calib[n] for n in numbers))
+        masks = None if self.masks is None else tuple(self.masks[n] for n in numbers)
+        return replace(self, frames=tuple(self.frames[n] for n in numbers), calib=calib, masks=masks)

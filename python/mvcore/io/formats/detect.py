@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ...errors import FormatError
@@ -38,13 +39,15 @@ READERS: tuple[tuple[str, Callable[[Path], Path | None], Callable[[Path], Found]
 """Name, finder (the path that the reader takes, or None) and reader of each format, the surest first."""
 
 
-def load(path: str | Path, *, images: bool = True) -> Scene:
+def load(path: str | Path, *, images: bool | str | Path = True, allow_outside: bool = False) -> Scene:
     """Read a scene; the format is found by itself.
 
     Parameters
     ----------
     path : a folder, or a calibration file in it.
-    images : False reads the cameras alone; image files may then be missing.
+    images : False reads the cameras alone; image files may then be missing. A folder is where the images lie, if the
+        calibration does not say or is wrong.
+    allow_outside : follow paths in the calibration that lead out of the data set's folder; they are refused otherwise.
 
     Returns
     -------
@@ -64,6 +67,8 @@ def load(path: str | Path, *, images: bool = True) -> Scene:
     for name, find, read in READERS:
         if (at := find(path)) is not None:
             found = read(at)
-            return to_scene(Found(found.records, found.source, found.bounds, name), images)
+            folder = None if isinstance(images, bool) else Path(images).absolute()
+            named = replace(found, format=name)
+            return to_scene(named, images is not False, images=folder, allow_outside=allow_outside, given=path)
     known = ", ".join(name for name, _, _ in READERS)
     raise FormatError(f"{path}: no calibration found; known formats: {known}")

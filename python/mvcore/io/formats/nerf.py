@@ -1,4 +1,8 @@
-"""NeRF / nerfstudio ``transforms.json``: camera-to-world, OpenGL axes, corner origin; per-frame values override common ones."""
+"""NeRF, instant-ngp and nerfstudio ``transforms.json``: camera-to-world, OpenGL axes, corner origin.
+
+Values of a frame override common ones. ``camera_model`` names the projection (nerfstudio), or ``is_fisheye`` does
+(instant-ngp); without either, distortion is OpenCV's k1 k2 p1 p2 k3.
+"""
 
 from __future__ import annotations
 
@@ -8,77 +12,93 @@ from typing import Any
 import numpy as np
 
 from ...errors import FormatError
-from .native import parse_json
-from .records import IMAGE_SUFFIXES, Found, Record, image_size
+from .native import numbers, parse_json, path_in, pixels
+from .records import Found, Record
 
 NAMES = ("transforms.json", "transforms_train.json")
+PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def find(path: Path) -> Path | None:
     """The file, if the path is one or holds one."""
     if path.is_file():
-        return path if path.name.startswith("transforms") and path.suffix == ".json" else None
+        return path if path.name.startswith("transforms") and path.suffix.lower() == ".json" else None
     return next((path / n for n in NAMES if (path / n).is_file()), None)
 
 
 def read(path: Path) -> Found:
-    """The views of a transforms file.
-
-    Raises
-    ------
-    FormatError
-        Also where a frame names a file outside the folder of ``transforms.json``.
-    """
+    """The views of a transforms file."""
     data = parse_json(path)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         raise FormatError(f"{path}: expected an object with a list 'frames'")
-    return Found([_frame(path, n, {**data, **f}) for n, f in enumerate(frames)], path)
+    records = []
+    for n, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise FormatError(f"{path}: frames[{n}]: expected an object, got {frame!r:.40}")
+        records.append(_frame(path, f"{path}: frames[{n}]", {**data, **frame}))
+    return Found(records, path)
 
 
-def _frame(path: Path, n: int, frame: dict[str, Any]) -> Record:
-    where = f"{path}: frames[{n}]"
-    image = _inside(path.parent, where, frame.get("file_path"))
-    mask = _inside(path.parent, where, frame["mask_path"]) if frame.get("mask_path") else None
-    pose = np.asarray(frame.get("transform_matrix"), np.float64)
-    if pose.shape not in ((4, 4), (3, 4)):
-        raise FormatError(f"{where}: transform_matrix: expected 4 x 4 numbers")
+def _frame(path: Path, where: str, frame: dict[str, Any]) -> Record:
+    image = path_in(f"{where}: file_path", frame.get("file_path"))
+    if image is None:
+        raise FormatError(f"{where}: file_path missing")
+    pose = numbers(f"{where}: transform_matrix", frame.get("transform_matrix"), (4, 4), (3, 4))
     rotation = (pose[:3, :3] * [1, -1, -1]).T
-    width, height = int(frame.get("w", 0)), int(frame.get("h", 0))
-    if not width and image.is_file():
-        width, height = image_size(image)
-    if not width:
-        raise FormatError(f"{where}: no size (w, h) and no image {image.name}")
-    fx = frame.get("fl_x")
-    if fx is None and frame.get("camera_angle_x"):
-        fx = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
-    if fx is None:
-        raise FormatError(f"{where}: neither fl_x nor camera_angle_x")
-    fy = frame.get("fl_y", fx)
-    cx, cy = frame.get("cx", width / 2), frame.get("cy", height / 2)
-    fisheye = str(frame.get("camera_model", "")).upper().endswith("FISHEYE")
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    distortion = [float(frame.get(k, 0.0)) for k in keys]
+    width, height = pixels(f"{where}: w", frame.get("w")), pixels(f"{where}: h", frame.get("h"))
+    distortion, fisheye = _lens(where, frame)
     return Record(
-        K=[[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]],
+        K=lambda width, height: _matrix(where, frame, width, height),
         R=rotation,
-        t=-rotation @ pose[:3, 3],
-        width=width,
-        height=height,
+        t=-rotation @ pose[:3, 3],  # the centre stays, also where R is rounded (`Camera`)
+        width=width if height else 0,
+        height=height if width else 0,
         image=image,
-        mask=mask,
-        name=str(frame["file_path"]),
-        distortion=distortion if any(distortion) else (),
-        fisheye=fisheye and any(distortion),
+        mask=path_in(f"{where}: mask_path", frame.get("mask_path")),
+        name=str(image),
+        distortion=distortion,
+        fisheye=fisheye,
     )
 
 
-def _inside(folder: Path, where: str, name: Any) -> Path:
-    if not isinstance(name, str) or not name:
-        raise FormatError(f"{where}: file_path missing")
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise FormatError(f"{where}: {name!r} lies outside {folder}")
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        return path
-    return next((p for s in IMAGE_SUFFIXES if (p := path.with_name(path.name + s)).is_file()), path.with_name(path.name + ".png"))
+def _number(where: str, frame: dict[str, Any], key: str, default: float | None = None) -> float | None:
+    value = frame.get(key)
+    return default if value is None else float(numbers(f"{where}: {key}", value, ()))
+
+
+def _matrix(where: str, frame: dict[str, Any], width: int, height: int) -> list[list[float]]:
+    fx, fy = _number(where, frame, "fl_x"), _number(where, frame, "fl_y")
+    if fx is None and fy is None:
+        fx, fy = (_focal(_number(where, frame, f"camera_angle_{a}"), side) for a, side in (("x", width), ("y", height)))
+    if fx is None and fy is None:
+        raise FormatError(f"{where}: neither fl_x nor camera_angle_x (an angle of 0 to pi)")
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    cx, cy = _number(where, frame, "cx", width / 2), _number(where, frame, "cy", height / 2)
+    return [[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]  # type: ignore[operator, list-item]
+
+
+def _focal(angle: float | None, side: int) -> float | None:
+    return 0.5 * side / float(np.tan(0.5 * angle)) if angle is not None and 0 < angle < np.pi else None
+
+
+def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float], bool]:
+    """OpenCV's coefficients, and whether they are the fisheye model's."""
+    model = str(frame.get("camera_model") or "").upper()
+    if model and model not in (*PERSPECTIVE, *FISHEYE):
+        known = ", ".join((*PERSPECTIVE, *FISHEYE))
+        raise FormatError(f"{where}: camera_model {model!r:.40} is not supported; expected one of {known}")
+    fisheye = model in FISHEYE or (not model and bool(frame.get("is_fisheye")))
+    k1, k2, k3, k4, k5, k6 = (_number(where, frame, f"k{n}", 0.0) or 0.0 for n in range(1, 7))
+    p1, p2 = (_number(where, frame, f"p{n}", 0.0) or 0.0 for n in (1, 2))
+    if fisheye:
+        if p1 or p2:
+            raise FormatError(f"{where}: p1, p2: expected 0 for a fisheye, got {p1:g}, {p2:g}")
+        return [k1, k2, k3, k4], True
+    if model == "FULL_OPENCV":
+        return [k1, k2, p1, p2, k3, k4, k5, k6], False
+    if k4:
+        raise FormatError(f"{where}: k4: expected 0 for a perspective camera (OpenCV has three radial terms), got {k4:g}; is it a fisheye?")
+    values = [k1, k2, p1, p2, k3]
+    return (values if any(values) else []), False

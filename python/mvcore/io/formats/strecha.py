@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .records import Found, Lines, Record, image_in
+from ..pairing import natural_order
+from .records import Found, Lines, Record
 
 
 def find(path: Path) -> Path | None:
@@ -18,7 +19,7 @@ def find(path: Path) -> Path | None:
 
 def read(folder: Path) -> Found:
     """The views of a folder, by name."""
-    return Found([_view(folder, path) for path in sorted(folder.glob("*.camera"))], folder)
+    return Found([_view(folder, path) for path in sorted(folder.glob("*.camera"), key=natural_order)], folder)
 
 
 def _view(folder: Path, path: Path) -> Record:
@@ -28,6 +29,8 @@ def _view(folder: Path, path: Path) -> Record:
     rotation = np.array([lines.numbers(n, 3) for n in (5, 6, 7)]).T
     center = np.array(lines.numbers(8, 3))
     width, height = lines.numbers(9, 2)
+    if not (width > 0 and height > 0):
+        raise lines.fail(9, f"expected width and height above 0, got {width:g} {height:g}")
     name = path.name.removesuffix(".camera")
-    image = image_in(folder, name) or image_in(folder.parent, name) or folder / name
-    return Record(K=k, R=rotation, t=-rotation @ center, width=int(width), height=int(height), image=image, name=name, line=1)
+    # The centre stays, also where R is rounded (`Camera`).
+    return Record(K=k, R=rotation, t=-rotation @ center, width=int(width), height=int(height), image=Path(name), name=name, line=1)
