@@ -140,8 +140,8 @@ def load_frame(frame: Frame, camera: Camera, index: int) -> Image:
     return np.ascontiguousarray(image)
 
 
-def load_mask(mask: Frame | None, camera: Camera, index: int) -> NDArray[np.uint8]:
-    """A mask, (h, w) uint8 or bool or a path, as 0 and 255 at its camera's size; all 255 for a view without one (None).
+def load_mask(mask: Frame, camera: Camera, index: int) -> NDArray[np.uint8]:
+    """A mask, (h, w) uint8 or bool or a path, as 0 and 255 at its camera's size.
 
     A mask of the same shape at another size is scaled.
 
@@ -151,8 +151,6 @@ def load_mask(mask: Frame | None, camera: Camera, index: int) -> NDArray[np.uint
         Another dtype, or a size of another shape than the camera's.
     """
     name = f"masks[{index}]"
-    if mask is None:
-        return np.full((camera.height, camera.width), 255, np.uint8)
     if isinstance(mask, str | Path):
         name = f"{name} ({Path(mask).name})"
         array = _turned(read_mask(mask), mask, camera)
@@ -183,9 +181,10 @@ def mask_warnings(masks: Sequence[NDArray[np.uint8] | None]) -> list[str]:
     A target seldom fills the image's border more than its inside: if most masks do, they are bright where it is not.
     """
     messages = []
-    present = [(n, m > 127) for n, m in enumerate(masks) if m is not None]
-    if missing := [n for n, m in enumerate(masks) if m is None]:
-        messages.append(f"{len(missing)} of {len(masks)} views have no mask and are not cut ({_some(missing)})")
+    present = [(n, m > 127) for n, m in enumerate(masks) if m is not None and not (m > 127).all()]
+    if len(present) < len(masks):
+        missing = sorted(set(range(len(masks))) - {n for n, _ in present})
+        messages.append(f"{len(missing)} of {len(masks)} views have no mask, or one that is all target ({_some(missing)})")
     if empty := [n for n, m in present if not m.any()]:
         messages.append(f"{len(empty)} of {len(masks)} masks are empty ({_some(empty)})")
     excess = [_border(m) - float(m.mean()) for _, m in present if m.any()]

@@ -137,9 +137,11 @@ def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruct
     run.all([surveying], "sparse points")
     survey: Survey = run.value(surveying)
     views, points, box, target = Views(whole, cameras), survey.points, survey.box, None
+    findings = [survey.findings]
     if inputs.masks is not None:
         target, _ = located(whole, cameras, survey.box, bounds, None, config)
         where = run.value(target)
+        findings.append(where.findings)
         if where.parts:
             views, box = cropped(inputs, whole, where, None, config), where.box
             run.all(views.pixels, "target")
@@ -149,7 +151,7 @@ def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruct
     tasks = frame_tasks(views, plan, config, target=target)
     run_frame(run, tasks)
     world = World(request.frame, request.calib, workdir)
-    return finished(run, views, plan, tasks, [survey.findings, plan.findings], survey.points, world)
+    return finished(run, views, plan, tasks, [*findings, plan.findings], survey.points, world)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from ..config import CarveConfig, DepthConfig, SparseConfig, StandingConfig, Sur
 from ..depth import RoughDepth, View, filter_depth, guided_depth, network_depth, refine_depth, seeded_depth, sweep_depth
 from ..errors import ReconstructionError
 from ..geometry.cameras import Camera
-from ..io.images import reduce, undistort
+from ..io.images import mask_warnings, reduce, undistort
 from ..mesh.hull_parts import Hulls, find_targets, motions, moved, on_targets
 from ..mesh.surface import Surface, cleaned, drop_cavities, drop_unseen, isosurface
 from ..mesh.texture import Given, texture
@@ -158,13 +158,15 @@ class Target:
     """What masks show together.
 
     parts : middle, box and volume of each target, none where no target is seen. hulls : their surfaces. box : (2, 3) around them.
-    crops : x, y, width, height of each view's part that shows them, in pixels of the undistorted view.
+    crops : x, y, width, height of each view's part that shows them, in pixels of the undistorted view. findings : what is
+    suspicious about masks that the caller gave.
     """
 
     parts: list[dict[str, Any]]
     hulls: Hulls
     box: Bounds
     crops: list[Part]
+    findings: Findings = field(default_factory=Findings)
 
 
 def locate(
@@ -182,10 +184,11 @@ def locate(
     ``least`` and ``margin`` are those of `VideoConfig`.
     """
     every = list(_Masks(views)) if masks is None else list(masks)
+    findings = Findings(warnings=mask_warnings(every) if masks is None else [])
     hull = target_hull(every, cameras, box, carving)
     parts, hulls = find_targets(hull, every, cameras, least)
     if not parts:
-        return Target([], hulls, box, [])
+        return Target([], hulls, box, [], findings)
     tight = np.stack([np.min([t["box"][0] for t in parts], 0), np.max([t["box"][1] for t in parts], 0)])
     if bounds is not None:
         tight = np.stack([np.maximum(tight[0], bounds[0]), np.minimum(tight[1], bounds[1])])
@@ -196,7 +199,7 @@ def locate(
         pad = 16 + (margin * (high - low)).astype(int)
         low, high = np.maximum(low - pad, 0), np.minimum(high + pad, (camera.width, camera.height))
         crops.append((int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])))
-    return Target(parts, hulls, tight, crops)
+    return Target(parts, hulls, tight, crops, findings)
 
 
 Part = tuple[int, int, int, int]

@@ -89,7 +89,8 @@ def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float], bool]:
     if model and model not in (*PERSPECTIVE, *FISHEYE):
         known = ", ".join((*PERSPECTIVE, *FISHEYE))
         raise FormatError(f"{where}: camera_model {model!r:.40} is not supported; expected one of {known}")
-    fisheye = model in FISHEYE or (not model and bool(frame.get("is_fisheye")))
+    flag = frame.get("is_fisheye") or frame.get("fisheye_model")
+    fisheye = model in FISHEYE or flag is True or flag == 1  # instant-ngp's flag
     k1, k2, k3, k4, k5, k6 = (_number(where, frame, f"k{n}", 0.0) or 0.0 for n in range(1, 7))
     p1, p2 = (_number(where, frame, f"p{n}", 0.0) or 0.0 for n in (1, 2))
     if fisheye:
