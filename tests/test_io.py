@@ -201,8 +201,9 @@ def test_missing_and_wrong_images(tmp_path, cameras):
     with pytest.raises(FormatError, match=r"20 x 10 pixels, its camera 64 x 48"):
         mvcore.load(tmp_path)
     (tmp_path / "images" / "00000001.png").unlink()
-    with pytest.raises(FormatError, match="does not exist"):
-        mvcore.load(tmp_path)
+    scene = mvcore.load(tmp_path)
+    assert [f.name for f in scene.frames] == ["00000000.png", "00000002.png"]
+    assert "1 of 3 views left out, as their images do not exist: images/00000001.png" in scene.warnings[0]
     assert len(mvcore.load(tmp_path, images=False)) == 3
     with pytest.raises(FormatError, match="known formats"):
         mvcore.load(tmp_path / "images")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...errors import FormatError
 from ..pairing import natural_order
-from .places import dataset_root
+from .places import dataset_root, places
 from .records import Found, Lines, Record
 
 MODELS = {
@@ -113,6 +113,7 @@ def read(folder: Path) -> Found:
     else:
         cameras, images = _cameras_text(folder / "cameras.txt"), _images_text(folder / "images.txt")
     root = dataset_root(folder)
+    base = next((f for level in places(folder).levels if (f := level / "images").is_dir()), root / "images")
     records = []
     for name, quaternion, t, camera, line in sorted(images, key=lambda i: i[0]):
         where = f"{folder}/images.txt:{line}" if line else f"{folder}/images.bin"
@@ -129,7 +130,7 @@ def read(folder: Path) -> Found:
                 t=t,
                 width=cameras[camera][1],
                 height=cameras[camera][2],
-                image=root / "images" / name,
+                image=base / name,
                 mask=mask,
                 name=name,
                 distortion=distortion,

@@ -111,9 +111,9 @@ def find_images(wanted: Sequence[Wanted], at: Places) -> tuple[list[Path | None]
     if any(direct):
         _refuse_outside(wanted, direct, at)
         return direct, []
-    found, warnings = _searched(wanted, at)
-    _refuse_outside(wanted, found, at)
-    return found, warnings
+    files, warnings = _searched(wanted, at)
+    _refuse_outside(wanted, files, at, elsewhere=any(files))
+    return files, warnings
 
 
 def find_masks_of(images: Sequence[Path | None], at: Places) -> list[Path | None]:
@@ -194,16 +194,15 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _refuse_outside(wanted: Sequence[Wanted], found: Sequence[Path | None], at: Places) -> None:
-    """Of paths that lead out only absolute ones of another machine are passed over, and only where others were found."""
-    for w, file in zip(wanted, found, strict=True):
-        if file is None and w.path is not None and not at.inside(at.base / w.path):
-            upwards = ".." in w.path.parts
-            if upwards or not any(found):
-                raise FormatError(
-                    f"{at.base}: image {str(w.path)!r} lies outside {at.root}; allow it with allow_outside=True (--allow-outside), "
-                    "or name the folder of the images with images=DIR (--images DIR)"
-                )
+def _refuse_outside(wanted: Sequence[Wanted], files: Sequence[Path | None], at: Places, elsewhere: bool = False) -> None:
+    """Only absolute paths of another machine are passed over, where images were found ``elsewhere`` under their names."""
+    for w, file in zip(wanted, files, strict=True):
+        if file is not None or w.path is None or at.inside(at.base / w.path) or (elsewhere and ".." not in w.path.parts):
+            continue
+        raise FormatError(
+            f"{at.base}: image {str(w.path)!r} lies outside {at.root}; allow it with allow_outside=True (--allow-outside), "
+            "or name the folder of the images with images=DIR (--images DIR)"
+        )
 
 
 def _names(wanted: Sequence[Wanted]) -> list[PurePath]:
