@@ -131,7 +131,9 @@ def test_nerf_lenses(tmp_path):
 
 def test_a_field_of_view_needs_the_images_size(tmp_path):
     angle = 2 * np.arctan(0.5)
-    camera = mvcore.load(nerf(tmp_path, {"fl_x": None, "fl_y": None, "w": None, "h": None, "cx": None, "cy": None, "camera_angle_x": angle}))
+    camera = mvcore.load(
+        nerf(tmp_path, {"fl_x": None, "fl_y": None, "w": None, "h": None, "cx": None, "cy": None, "camera_angle_x": angle})
+    )
     assert np.allclose(camera.calib[0].K, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
     with pytest.raises(FormatError, match="neither fl_x nor camera_angle_x"):
         mvcore.load(nerf(tmp_path, {"fl_x": None, "fl_y": None}))

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
+from PIL import TiffImagePlugin
 
 from ..errors import FormatError
 from .pairing import natural_order
@@ -24,6 +25,7 @@ DEPTHS = (8, 10, 12, 14, 16)
 BRIGHT = 99.5
 """Percentile of a linear image that becomes white; lamps and reflections lie above."""
 EXIF_ORIENTATION = 0x0112
+WIDTH, LENGTH = 256, 257  # TIFF tags
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,13 @@ def read_header(path: str | Path) -> Header:
         raise FileNotFoundError(f"{path}: no such image")
     if path.suffix.lower() == ".exr":
         return _exr_header(path)
-    with _open(path) as image:
+    try:
+        opened = _open(path)
+    except FormatError:
+        if path.suffix.lower() not in (".tif", ".tiff"):
+            raise
+        return _tiff_header(path)
+    with opened as image:
         try:
             orientation = int(image.getexif().get(EXIF_ORIENTATION, 1))
         except Exception:
@@ -155,6 +163,26 @@ def _open(path: Path) -> PillowImage.Image:
         raise FormatError(f"{path}: not an image that can be read") from None
 
 
+def _tiff_header(path: Path) -> Header:
+    """The size in a TIFF of a kind that Pillow has no mode for: float colours, more than four channels."""
+    try:
+        with path.open("rb") as stream:
+            tags = TiffImagePlugin.ImageFileDirectory_v2(stream.read(8))
+            stream.seek(tags.next)
+            tags.load(stream)
+        width, height = int(tags[WIDTH]), int(tags[LENGTH])
+    except Exception:
+        raise FormatError(f"{path}: not an image that can be read") from None
+    _check_size(path, width, height)
+    return Header(width, height)
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    most = 2 * (PillowImage.MAX_IMAGE_PIXELS or 2**27)
+    if width < 1 or height < 1 or width * height > most:
+        raise FormatError(f"{path}: declares {width} x {height} pixels, expected at most {most} in all")
+
+
 def _register_heif(path: Path) -> None:
     try:
         import pillow_heif
@@ -192,9 +220,7 @@ def _exr_header(path: Path) -> Header:
     file = _exr_file(path, header_only=True)
     low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
     width, height = (int(v) for v in high - low + 1)
-    most = 2 * (PillowImage.MAX_IMAGE_PIXELS or 2**28)
-    if width * height > most:
-        raise FormatError(f"{path}: declares {width} x {height} pixels, expected at most {most} in all")
+    _check_size(path, width, height)
     return Header(width, height, 1, "A" in {c.name for c in file.header()["channels"]})
 
 

@@ -22,7 +22,7 @@ LABELS = 64
 FEW = 8
 """Values of an image that surely holds labels, also where some are close to 0."""
 BETWEEN = 0.05
-"""Share of a mask's non-zero pixels between dark and bright from which it is a label image rather than a soft mask."""
+"""Share of a mask's non-zero pixels that are flat and between dark and bright from which it is a label image, not a soft mask."""
 NOISE = 32
 """Grey levels that JPEG adds to a black mask, of 255."""
 INVERTED = 0.15
@@ -68,11 +68,14 @@ def _target(mask: NDArray[Any], lossy: bool = False) -> NDArray[np.bool_]:
     if not most > 0 or (lossy and mask.dtype == np.uint8 and most < NOISE):
         return np.zeros(mask.shape, bool)
     inside = mask > 0
-    values = len(np.unique(mask))
-    edge = most / 8
-    between = inside & (mask < most - edge) & ((mask > edge) | (values <= FEW))
-    if not lossy and values <= LABELS and between.sum() > BETWEEN * inside.sum():
-        return inside
+    values = 0 if lossy else len(np.unique(mask))
+    if 2 < values <= LABELS:
+        square = np.ones((3, 3), np.uint8)
+        flat = cv2.erode(mask, square) == cv2.dilate(mask, square)
+        edge = most / 8
+        between = flat & inside & (mask < most - edge) & ((mask > edge) | (values <= FEW))
+        if between.sum() > BETWEEN * inside.sum():
+            return inside
     return mask > most / 2
 
 
