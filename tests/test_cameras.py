@@ -59,7 +59,7 @@ def test_a_rounded_rotation_moves_no_centre(offset):
     ):
         assert np.abs(camera.center - center).max() < 1e-8
         assert np.abs(camera.R @ camera.R.T - np.eye(3)).max() < 1e-14
-        assert np.abs(camera.project([offset + [0.1, 0.1, 0]]) - true.project([[0.1, 0.1, 0]])).max() < 0.01  # the rounding of R
+        assert np.abs(camera.project([offset + np.array([0.1, 0.1, 0])]) - true.project([[0.1, 0.1, 0]])).max() < 0.01  # the rounding of R
 
 
 def test_rotations_within_float64_stay_as_they_are():

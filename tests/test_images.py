@@ -73,7 +73,7 @@ def test_float_images(tmp_path):
         assert np.abs(read_image(tmp_path / name)[..., 0] - expected).max() <= 2
         assert (read_header(tmp_path / name).width, read_header(tmp_path / name).height) == (64, 48)
     (tmp_path / "bad.exr").write_bytes(b"v/1\x01" + bytes(100))
-    with pytest.raises(FormatError, match="bad.exr: not an EXR image"):
+    with pytest.raises(FormatError, match=r"bad.exr: not an EXR image"):
         read_image(tmp_path / "bad.exr")
 
 
@@ -112,7 +112,7 @@ def test_a_calibration_at_another_scale(tmp_path):
     point = [[0.1, 0.2, 2.0]]
     assert np.allclose(found.calib[0].project(point), (camera().project(point) + 0.5) / 2 - 0.5)
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((27, 48, 3), np.uint8))
-    with pytest.raises(FormatError, match="image 1.png has 48 x 27 pixels, its camera 64 x 48"):
+    with pytest.raises(FormatError, match=r"image 1.png has 48 x 27 pixels, its camera 64 x 48"):
         mvcore.load(tmp_path)
 
 
@@ -122,12 +122,12 @@ def test_bombs_and_damaged_images_are_refused(tmp_path):
 
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0))
     (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b""))
-    with pytest.raises(FormatError, match="bomb.png: declares too many pixels"):
+    with pytest.raises(FormatError, match=r"bomb.png: declares too many pixels"):
         read_image(tmp_path / "bomb.png")
     (tmp_path / "text.png").write_text("no image")
-    with pytest.raises(FormatError, match="text.png: not an image"):
+    with pytest.raises(FormatError, match=r"text.png: not an image"):
         read_image(tmp_path / "text.png")
-    with pytest.raises(FileNotFoundError, match="no such image"):
+    with pytest.raises(FileNotFoundError, match=r"no such image"):
         read_image(tmp_path / "none.png")
 
 
@@ -196,7 +196,7 @@ def test_masks_pair_by_number(tmp_path):
     masks = find_masks(tmp_path, ["images/v02.jpg", "images/v10.jpg", "images/v01.jpg"])
     assert [m.stem for m in masks] == ["mask_2", "mask_10", "mask_1"]
     assert find_masks(tmp_path, ["mask_10.jpg", "mask_3.jpg"]) == [tmp_path / "mask_10.png", None]
-    with pytest.raises(FormatError, match="no mask for a.jpg"):
+    with pytest.raises(FormatError, match=r"no mask for a.jpg"):
         find_masks(tmp_path, ["a.jpg", "b.jpg"])
 
 

@@ -120,15 +120,15 @@ def test_a_folder_of_images_that_the_caller_names(tmp_path):
     native(tmp_path / "calib", [None, None, None])
     for n in NAMES:
         image(tmp_path / "elsewhere" / "of" / f"photo_{n}")
-    with pytest.raises(FormatError, match="does not say where its images are.*--images DIR"):
+    with pytest.raises(FormatError, match=r"does not say where its images are.*--images DIR"):
         mvcore.load(tmp_path / "calib")
     scene = mvcore.load(tmp_path / "calib", images=tmp_path / "elsewhere")
     assert [f.name for f in scene.frames] == ["photo_a.png", "photo_b.png", "photo_c.png"]
     assert "in order" in scene.warnings[0]
-    with pytest.raises(FileNotFoundError, match="no such folder of images"):
+    with pytest.raises(FileNotFoundError, match=r"no such folder of images"):
         mvcore.load(tmp_path / "calib", images=tmp_path / "nowhere")
     image(tmp_path / "elsewhere" / "more.png")
-    with pytest.raises(FormatError, match="no image for"):
+    with pytest.raises(FormatError, match=r"no image for"):
         mvcore.load(tmp_path / "calib", images=tmp_path / "elsewhere")
 
 
@@ -141,7 +141,7 @@ def test_one_image_in_each_cameras_folder(tmp_path):
     (tmp_path / "cameras.json").write_text(json.dumps(data))
     assert [f.parent.parent.name for f in mvcore.load(tmp_path).frames] == ["cam0", "cam1"]
     image(tmp_path / "cam1" / "data" / "0002.png")
-    with pytest.raises(FormatError, match="cam1: expected one image of a camera, got 2"):
+    with pytest.raises(FormatError, match=r"cam1: expected one image of a camera, got 2"):
         mvcore.load(tmp_path)
 
 
@@ -152,12 +152,12 @@ def test_paths_that_lead_out_are_refused(tmp_path):
         image(folder / n)
     for path in ("../../secret/a.png", str(tmp_path / "secret" / "a.png"), "x/../../../secret/a.png"):
         native(folder, [path, "b.png"])
-        with pytest.raises(FormatError, match="lies outside"):
+        with pytest.raises(FormatError, match=r"lies outside"):
             mvcore.load(folder)
         assert len(mvcore.load(folder, allow_outside=True)) == 2
         assert len(mvcore.load(folder, images=False)) == 2  # no image is opened
     native(folder, ["a.png", "b.png"], mask="../../secret/a.png")
-    with pytest.raises(FormatError, match="mask '../../secret/a.png' lies outside"):
+    with pytest.raises(FormatError, match=r"mask '../../secret/a.png' lies outside"):
         mvcore.load(folder)
 
 
@@ -172,7 +172,7 @@ def test_usual_folders_beside_the_calibration_and_links_are_followed(tmp_path):
     assert mvcore.load(tmp_path / "linked").frames[0] == tmp_path / "linked" / "images" / "a.png"
     (tmp_path / "linked" / "images").unlink()
     (tmp_path / "linked" / "images").write_text("../store")
-    with pytest.raises(FormatError, match="no folder but a file with the text '../store', a link that was not restored"):
+    with pytest.raises(FormatError, match=r"no folder but a file with the text '../store', a link that was not restored"):
         mvcore.load(tmp_path / "linked")
 
 
@@ -277,7 +277,7 @@ def test_mvsnet_numbers_and_reduced_intrinsics(tmp_path):
     assert np.allclose(scene.calib[0].K, [[60, 0, 31.9], [0, 60, 23.9], [0, 0, 1]])
     assert "smaller by 4" in scene.warnings[0]
     (tmp_path / "cams" / "00000000_cam.txt").write_text("extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 0\nintrinsic\n1 0 0\n0 1 0\n0 0 1\n")
-    with pytest.raises(FormatError, match="cam.txt:5: expected '0 0 0 1'"):
+    with pytest.raises(FormatError, match=r"cam.txt:5: expected '0 0 0 1'"):
         mvcore.load(tmp_path)
 
 
@@ -290,7 +290,7 @@ def test_middlebury_names_in_quotes(tmp_path):
         image(tmp_path / n)
     assert [c.name for c in mvcore.load(tmp_path).calib] == names
     (tmp_path / "x_par.txt").write_text(f'3\n"a view.png" {numbers}\n')
-    with pytest.raises(FormatError, match="x_par.txt:2: expected 3 views, got 1"):
+    with pytest.raises(FormatError, match=r"x_par.txt:2: expected 3 views, got 1"):
         mvcore.load(tmp_path)
 
 
