@@ -285,9 +285,24 @@ def test_absolute_coordinates_lose_nothing(scene, offset):
     assert np.allclose(there.cameras[0].t, moved[0].t)
 
 
-@given(st.floats(-180, 180), st.tuples(*[st.floats(-1e6, 1e6)] * 3))
-def test_a_pose_of_the_local_frame_is_one_of_the_world(angle, origin):
-    frame, pose = LocalFrame(np.array(origin)), turned(angle, (0.3, -0.2, 0.1))
+def test_a_mirrored_world_gives_the_mirrored_mesh(scene):
+    cameras, frames, masks = scene
+    box = np.array([[-0.6, -0.6, -0.6], [0.6, 0.6, 0.7]])
+    here = mvcore.reconstruct(frames, cameras, masks=masks, bounds=box, config=SETTINGS)
+    mirrored = mvcore.Calibration(tuple(cameras), mirrored=True)
+    box[:, 2] = -box[::-1, 2]
+    there = mvcore.reconstruct(frames, mirrored, masks=masks, bounds=box, config=SETTINGS)
+    assert (there.vertices == here.vertices * [1, 1, -1]).all()
+    assert (there.faces == here.faces[:, ::-1]).all()  # counter-clockwise from outside again
+    assert (there.bounds[:, :2] == here.bounds[:, :2]).all()
+    assert (there.bounds[:, 2] == -here.bounds[::-1, 2]).all()
+    assert there.mesh.volume > 0
+    assert there.cameras.mirrored
+
+
+@given(st.floats(-180, 180), st.tuples(*[st.floats(-1e6, 1e6)] * 3), st.booleans())
+def test_a_pose_of_the_local_frame_is_one_of_the_world(angle, origin, mirrored):
+    frame, pose = LocalFrame(np.array(origin), mirrored), turned(angle, (0.3, -0.2, 0.1))
     x = np.array([0.5, 1.0, -2.0])
     world = frame.pose(pose) @ np.append(frame.world(x), 1)
     assert np.allclose(world[:3], frame.world(pose[:3, :3] @ x + pose[:3, 3]), atol=1e-8)

@@ -246,7 +246,7 @@ def test_bare_and_mirrored_projection_matrices(tmp_path):
     scene = written(flip, bounds=[[-1, -2, -3], [1, 2, 4]])
     assert scene.mirrored
     assert "left-handed" in scene.warnings[0]
-    assert scene.bounds.tolist() == [[-1, -2, -4], [1, 2, 3]]
+    assert scene.bounds.tolist() == [[-1, -2, -3], [1, 2, 4]]
     point = np.array([0.1, 0.2, -0.1, 1])
     working = np.linalg.inv(scene.mirror) @ point
     caller = cameras[2].projection @ flip @ point

@@ -59,17 +59,7 @@ def pair_by_name(
     files = sorted(candidates, key=lambda p: (natural_order(p.parent), natural_order(p)))
     if not wanted or not files:
         return _whole(wanted, files, [None] * len(wanted), what, partial)
-    best: list[Path | None] = [None] * len(wanted)
-    clash = ""
-    for key in _KEYS[:-1] if exact else _KEYS:
-        pairs, problem = _match(wanted, files, key, what)
-        if _paired(pairs) == len(pairs) > 0:
-            return pairs
-        clash = clash or problem
-        if _paired(pairs) > _paired(best) and (key is not _numbers or _paired(pairs) == len(files)):
-            best = pairs
-    if clash:
-        raise FormatError(clash)
+    best = _best(wanted, files, what, _KEYS[:-1] if exact else _KEYS)
     if _paired(best):
         return _whole(wanted, files, best, what, partial)
     if not exact and len(files) == len(wanted):
@@ -79,6 +69,23 @@ def pair_by_name(
             ordered[n] = file
         return ordered
     return _whole(wanted, files, [None] * len(wanted), what, partial)
+
+
+def _best(names: Sequence[PurePath], files: Sequence[Path], what: str, keys: Sequence[Key]) -> list[Path | None]:
+    """The pairs of the strictest key that pairs all names, else of the one that pairs most."""
+    best: list[Path | None] = [None] * len(names)
+    clash = ""
+    for key in keys:
+        pairs, problem = _match(names, files, key, what)
+        if _paired(pairs) == len(pairs) > 0:
+            return pairs
+        clash = clash or problem
+        # Numbers alone pair wrongly where they start elsewhere: all files must have a name.
+        if _paired(pairs) > _paired(best) and (key is not _numbers or _paired(pairs) == len(files)):
+            best = pairs
+    if clash:
+        raise FormatError(clash)
+    return best
 
 
 def _paired(pairs: Sequence[Path | None]) -> int:

@@ -23,9 +23,8 @@ class Scene:
     format : what the calibration was read as.
     warnings : what was assumed, scaled, or left out.
 
-    A calibration of a left-handed world (``mirrored``) is read into its reflection in z: ``calib`` and ``bounds`` are of the
-    reflected, right-handed world, and results go back to the caller's by ``mirror`` (X_caller = mirror X, with faces turned
-    round: their corners in reverse order). What the caller names in its own world (bounds) goes the same way in.
+    The cameras of a left-handed world (``mirrored``) are those of its reflection in z: X_caller = mirror X. Everything else, such as
+    ``bounds`` and what `reconstruct` returns, is in the caller's world.
     """
 
     frames: Sequence[Frame]

@@ -123,10 +123,10 @@ def _request(frames: Any, calib: Any, masks: Any, bounds: ArrayLike | None) -> _
     if isinstance(masks, str | Path):
         masks = find_masks(masks, frames)
     require(masks is None or len(masks) == len(frames), "masks", f"{len(frames)}, one a frame", len(masks or ()))
-    frame = LocalFrame.of(list(calib))
+    frame = LocalFrame.of(calib)
     cameras = frame.cameras(list(calib))
     inputs = Inputs(photographs(frames, cameras), None if masks is None else mask_sources(masks, cameras), cameras)
-    return _Request(inputs, calib, None if box is None else frame.inwards(box), frame)
+    return _Request(inputs, calib, None if box is None else frame.box_inwards(box), frame)
 
 
 def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruction:
@@ -169,17 +169,17 @@ def finished(
     """A frame's result in the caller's frame, with its report."""
     get, frame = run.runner.get, world.frame
     mesh = get(tasks.textured)
-    box = frame.world(plan.box)
+    box = frame.world_box(plan.box)
     every = [*findings, get(tasks.kept), get(tasks.extracted).findings, get(tasks.cleaned).findings, mesh.findings]
     every.append(Findings({"bounds": box.tolist()}))
     cameras = zip(views.cameras, world.calib, strict=True)
     return Reconstruction(
         vertices=frame.world(mesh.vertices),
-        faces=mesh.faces,
+        faces=frame.faces(mesh.faces),
         uv=mesh.uv,
         texture=mesh.texture,
         depths=stored_depths(world.workdir, run.runner, tasks.filtered),
-        cameras=Calibration(tuple(replace(view, t=given.t) for view, given in cameras), world.calib.source),
+        cameras=Calibration(tuple(replace(view, t=given.t) for view, given in cameras), world.calib.source, frame.mirrored),
         sparse=replace(points, positions=frame.world(points.positions)),
         bounds=box,
         face_views=mesh.face_views,

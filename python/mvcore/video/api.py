@@ -125,14 +125,14 @@ def _job(clips: Any, calib: Any, masks: Any, background: Any, regions: Any, boun
         clips = with_calibration(clips, calib)
     clips.calib.check_baselines()
     plates = [None] * len(clips.clips) if background is False else _plates(clips, background)
-    frame, box = LocalFrame.of(list(clips.calib)), check_bounds(bounds)
+    frame, box = LocalFrame.of(clips.calib), check_bounds(bounds)
     return Job(
         clips,
         None if masks is None else _mask_clips(masks, clips),
         plates,
         _regions(regions or {}, clips),
         background is False and masks is None,
-        None if box is None else frame.inwards(box),
+        None if box is None else frame.box_inwards(box),
         config,
         frame,
     )

@@ -271,7 +271,7 @@ class ClipRun:
             return self._empty(done, learnt, where, world)
         result = finished(done.run, done.views, done.plan, done.tasks, done.findings, done.points, world)
         parts = done.run.value(done.target).parts if done.target is not None else []
-        placed = [p | {"middle": world.frame.world(p["middle"]).tolist(), "box": world.frame.world(p["box"]).tolist()} for p in parts]
+        placed = [p | {"middle": world.frame.world(p["middle"]).tolist(), "box": world.frame.world_box(p["box"]).tolist()} for p in parts]
         result.report |= where | {"targets": tracker.follow(done.number, placed)}
         return result
 
@@ -285,7 +285,7 @@ class ClipRun:
             depths=[None] * len(self.job.clips.clips),
             cameras=self.job.clips.calib,
             sparse=stages.no_points(len(self.job.clips.clips)),
-            bounds=world.frame.world(learnt.survey.box),
+            bounds=world.frame.world_box(learnt.survey.box),
             report=assembled([said], done.run.ledger, self.job.config, len(self.job.clips.clips)),
         )
 

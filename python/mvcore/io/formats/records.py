@@ -101,16 +101,13 @@ def to_scene(
     cameras = [_camera(record, _where(found, record)) for record, _ in fitted]
     messages += _said(found, fitted)
     masks, alpha = _masks(records, at, messages) if need_images else ([at.absolute(r.mask) for r in records], False)
-    bounds = found.bounds
     if found.mirrored:
         messages.append(MIRRORED)
-        if bounds is not None:
-            bounds = np.stack([[*bounds[0, :2], -bounds[1, 2]], [*bounds[1, :2], -bounds[0, 2]]])
     return Scene(
         frames=tuple(record.image for record in records),  # type: ignore[arg-type]
         calib=Calibration(tuple(cameras), str(found.source), found.mirrored),
         masks=tuple(masks) if any(masks) else None,
-        bounds=bounds,
+        bounds=found.bounds,
         format=found.format,
         warnings=(*found.warnings, *messages),
         alpha=alpha,
@@ -119,7 +116,7 @@ def to_scene(
 
 MIRRORED = (
     "the calibration's world is mirrored (left-handed: its projection matrices have negative determinants with the target in "
-    "front): it is reconstructed reflected in z"
+    "front): its reflection in z is reconstructed, and the result is reflected back"
 )
 
 
