@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mvcore.errors import FormatError
@@ -17,8 +17,8 @@ DTYPES = (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.float32, np.float
 MATRICES = st.sampled_from(DTYPES).flatmap(
     lambda kind: hnp.arrays(kind, hnp.array_shapes(min_dims=2, max_dims=4, max_side=4)),
 )
-# cv2 writes texts byte by byte; "%" and friends are what it quotes.
-TEXTS = st.text(st.characters(codec="ascii", min_codepoint=32, max_codepoint=126), max_size=12)
+# cv2 does not read back all that it writes: quotes, apostrophes and some signs at the ends of a text are lost or refused.
+TEXTS = st.from_regex(r"[A-Za-z_0-9][A-Za-z_0-9 .@:/()+=%#-]{0,10}[A-Za-z_]", fullmatch=True)
 ENDINGS = ("yml", "xml", "json")
 
 
@@ -28,7 +28,7 @@ def storage(path, flags=0):
 
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("flags", [0, cv2.FILE_STORAGE_BASE64])
-@settings(max_examples=60)
+@settings(max_examples=15, phases=[Phase.explicit, Phase.generate])
 @given(matrix=MATRICES, text=TEXTS, number=st.floats(), whole=st.integers(-(2**31), 2**31 - 1), names=st.lists(TEXTS, max_size=4))
 def test_what_opencv_writes_reads_the_same(tmp_path_factory, ending, flags, matrix, text, number, whole, names):
     path = tmp_path_factory.mktemp("storage") / f"a.{ending}"
@@ -46,11 +46,10 @@ def test_what_opencv_writes_reads_the_same(tmp_path_factory, ending, flags, matr
     np.testing.assert_array_equal(read["matrix"], back.getNode("matrix").mat().astype(np.float64))
     np.testing.assert_equal(float(read["number"]), back.getNode("number").real())
     assert read["whole"] == whole
-    if not (ending == "xml" and text and text.strip('"') != text):  # a quote at an end of an XML text is lost in cv2 as well
-        assert str(read["text"]) == back.getNode("text").string()
+    assert read["text"] == text == back.getNode("text").string()
     node = back.getNode("names")
-    if not any('"' in n for n in names) and not (ending == "xml" and len(names) < 2):  # XML: one value is no list
-        assert [str(n) for n in read["names"] or []] == [node.at(n).string() for n in range(node.size())]
+    if len(names) != 1 or ending != "xml":  # in XML one value is no list
+        assert (read["names"] or []) == names == [node.at(n).string() for n in range(len(names))]
     back.release()
 
 
@@ -65,7 +64,9 @@ def test_appended_documents_are_one_storage(tmp_path):
 
 def test_dialect(tmp_path):
     path = tmp_path / "a.yml"
-    path.write_text('\ufeff%YAML:1.0\n---\nnames:\n  - 01\n  - cam 2\n  - "03"\n  - 4\nK_cam 2: 1.\na: .Nan\nb: -.Inf\nc:\n', encoding="utf-8")
+    path.write_text(
+        '\ufeff%YAML:1.0\n---\nnames:\n  - 01\n  - cam 2\n  - "03"\n  - 4\nK_cam 2: 1.\na: .Nan\nb: -.Inf\nc:\n', encoding="utf-8"
+    )
     read = read_filestorage(path)
     assert read["names"] == ["01", "cam 2", "03", 4]
     assert read["K_cam 2"] == 1
@@ -81,7 +82,7 @@ MATRIX = "%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: {rows}\n   cols: 2\n   dt
     ("text", "message"),
     [
         (MATRIX.format(rows=1, dt="d", data="1., 2., 3."), "a.yml:3: matrix: expected 1 x 2 values, got 3"),
-        (MATRIX.format(rows=1, dt="d", data="!!binary x, 2."), "a.yml:3: matrix: expected numbers"),
+        (MATRIX.format(rows=1, dt="d", data="!!binary x, 2."), "a.yml:7: expected numbers in base64"),
         (MATRIX.format(rows=3000000000, dt="d", data="1."), "a.yml:3: matrix: expected whole numbers"),
         (MATRIX.format(rows=-1, dt="d", data="1."), "a.yml:3: matrix: expected whole numbers"),
         (MATRIX.format(rows=1, dt="99999999d", data="1."), "a.yml:3: matrix: expected a type"),

@@ -37,6 +37,8 @@ MOST_DIGITS = 400
 
 TYPES = {"u": "u1", "c": "i1", "w": "u2", "s": "i2", "n": "u4", "i": "i4", "f": "f4", "d": "f8", "h": "f2"}
 """NumPy types of OpenCV's letters, as they are stored in base64."""
+STORED = {"f": np.float32, "h": np.float16}
+"""Types whose decimals are rounded when they are read, as OpenCV does."""
 TYPE = re.compile(r"([0-9]{0,3})([a-zA-Z])")
 MATRIX, ND_MATRIX = "opencv-matrix", "opencv-nd-matrix"
 BASE64 = "$base64$"
@@ -150,6 +152,8 @@ def _documents(events: Iterator[Any]) -> Iterator[Any]:
             plain = event.implicit[0] and not event.style
             naming = bool(stack) and isinstance(stack[-1].value, dict) and stack[-1].key is None
             value = _scalar(event.value) if plain and not naming else event.value
+            if (event.tag or "").endswith(":binary") or event.value.startswith(BASE64):
+                value = _decoded(event.value.removeprefix(BASE64), line)
         elif isinstance(event, yaml.SequenceEndEvent | yaml.MappingEndEvent):
             ended = stack.pop()
             value = _finished(ended.value, ended.tag, ended.line)
@@ -207,24 +211,25 @@ def _matrix(node: dict[str, Any], kind: str, line: int) -> NDArray[np.float64]:
     return data.reshape(shape)
 
 
-def _values(data: Any, letter: str, line: int) -> NDArray[np.float64]:
-    if isinstance(data, str):
-        return _decoded(data.removeprefix(BASE64), letter, line)
-    values = data if isinstance(data, list) else [] if data is None else [data]
+def _values(values: Any, letter: str, line: int) -> NDArray[np.float64]:
+    values = values if isinstance(values, list) else [] if values is None else [values]
     try:
-        return np.array([float(v) for v in values], np.float64)
+        with np.errstate(over="ignore"):
+            array = np.array([float(v) for v in values]).astype(STORED.get(letter, np.float64))
+        return array.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         wrong = next(v for v in values if type(v) not in (int, float))
         raise _Refused(f"matrix: expected numbers, got {wrong!r:.80}", line) from None
 
 
-def _decoded(text: str, letter: str, line: int) -> NDArray[np.float64]:
-    """The values of a matrix that was written in base64."""
+def _decoded(text: str, line: int) -> list[Any]:
+    """The numbers of a sequence that was written in base64: a header with their type, then little-endian values."""
     try:
         raw = base64.b64decode("".join(text.split()), validate=True)
-        return np.frombuffer(raw[BASE64_HEADER:], "<" + TYPES[letter]).astype(np.float64)
-    except (binascii.Error, ValueError) as error:
-        raise _Refused(f"matrix: not base64: {error}", line) from None
+        kind = TYPE.fullmatch(raw[:BASE64_HEADER].decode("ascii").strip())
+        return np.frombuffer(raw[BASE64_HEADER:], "<" + TYPES[kind[2] if kind else ""]).tolist()
+    except (binascii.Error, ValueError, KeyError) as error:
+        raise _Refused(f"expected numbers in base64 behind their type: {error}", line) from None
 
 
 class _Tree(ElementTree.TreeBuilder):
@@ -300,7 +305,7 @@ def _words(text: str | None) -> list[Any]:
 def _element(element: ElementTree.Element) -> Any:
     """An element's value; its depth is limited by `read_xml`."""
     if element.get("type_id") == "binary":
-        return element.text or ""
+        return _decoded(element.text or "", 0)
     items = _words(element.text)
     named: dict[str, Any] = {}
     for child in element:
