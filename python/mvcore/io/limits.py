@@ -17,6 +17,9 @@ MOST_NODES = 1_000_000
 MOST_DEPTH = 64
 """Levels of nesting of a YAML, XML or JSON file; calibrations have four."""
 
+MOST_SIDE = 1 << 17
+"""Pixels along a side of an image."""
+
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
     """A UTF-8 text file (a byte order mark is passed over) of at most ``most`` bytes.
