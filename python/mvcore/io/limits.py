@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import lzma
 import math
+import os
 import re
 import struct
 import zipfile
@@ -67,10 +68,9 @@ def read_bytes(path: Path, most: int) -> bytes:
     if path.exists() and not path.is_file():
         raise FormatError(f"{path}: expected a regular file")
     with path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise FormatError(f"{path}: expected a file of at most {most >> 20} MiB")
-    return data
+        if os.fstat(file.fileno()).st_size > most:
+            raise FormatError(f"{path}: expected a file of at most {most >> 20} MiB")
+        return file.read()
 
 
 def read_json(path: Path, most: int = MOST_TEXT) -> Any:
