@@ -42,9 +42,10 @@ def scenes(folder: Path) -> dict[str, Path]:
         _stereo,
     ):
         name = build.__name__.strip("_")
-        (folder / name).mkdir()
+        (folder / name / "images").mkdir(parents=True)
         for n, image in enumerate(images):
             cv2.imwrite(str(folder / name / f"{n}.png"), image)
+            cv2.imwrite(str(folder / name / "images" / f"{n:03d}.png"), image)
         build(folder / name, scene)
         out[name] = folder / name
     return out
@@ -68,6 +69,8 @@ def _colmap_binary(folder: Path, scene) -> None:
 
 def _mvsnet(folder: Path, scene) -> None:
     save_calibration(folder / "out", scene, "mvsnet")
+    for part in (folder / "out").iterdir():
+        part.rename(folder / part.name)
 
 
 def _nerf(folder: Path, scene) -> None:

@@ -1,18 +1,14 @@
 //! Checks of arguments before a kernel sees them; each error names the argument as the caller wrote it.
 
-use crate::convert::{run, slice};
-use mvcore::{Error, memory};
+use crate::convert::{run, slice, unfit};
+use mvcore::memory;
 use numpy::{Element, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use std::fmt::Display;
 
 /// Fails unless `holds`.
 pub fn check(py: Python<'_>, holds: bool, argument: &'static str, expected: &str, got: impl Display) -> PyResult<()> {
-    if holds {
-        return Ok(());
-    }
-    let error = Error::InvalidInput { argument, expected: expected.to_owned(), got: got.to_string() };
-    run(py, || Err(error))
+    if holds { Ok(()) } else { Err(unfit(py, argument, expected, got)) }
 }
 
 /// Fails unless `low <= value <= high`; NaN fails.

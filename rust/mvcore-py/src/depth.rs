@@ -1,7 +1,7 @@
 //! Bindings of the depth kernels.
 
 use crate::checks::{check, finite, room, shaped, within};
-use crate::convert::{array, map_of, picture, raster, rasters, run, slice, sources};
+use crate::convert::{array, map_of, picture, raster, rasters, run, slice, sources, unfit};
 use mvcore::aggregate::Penalties;
 use mvcore::correlate::{Features, Planes, Visibility};
 use mvcore::median::MedianParams;
@@ -10,7 +10,6 @@ use numpy::{
     PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArrayDyn,
     PyReadwriteArray3, PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 /// Of `refine`; a dozen are common.
@@ -67,7 +66,7 @@ pub fn expect<'py>(
     shaped(py, "expected", expected.shape(), &costs.shape()[..2])?;
     shaped(py, "confidence", confidence.shape(), &costs.shape()[..2])?;
     let (expected, confidence) = (slice(&expected, "expected")?, slice(&confidence, "confidence")?);
-    let values = costs.as_slice_mut().map_err(|_| PyValueError::new_err("costs: expected a C-contiguous array"))?;
+    let values = costs.as_slice_mut().map_err(|_| unfit(py, "costs", "a C-contiguous array", "another"))?;
     run(py, || mvcore::expect::expect(values, planes, expected, confidence, weight, reach))
 }
 
@@ -161,7 +160,11 @@ pub fn refine<'py>(
     shaped(py, "prior", prior.shape(), &[reference.height, reference.width])?;
     within(py, "iterations", iterations as f64, 0.0, MOST_ITERATIONS)?;
     let numbers = [low, high, step, max_slope, prior_weight, prior_reach, geometry_weight];
-    finite(py, "low, high, step, max_slope, prior_weight, prior_reach, geometry_weight", numbers.map(f64::from).into_iter())?;
+    finite(
+        py,
+        "low, high, step, max_slope, prior_weight, prior_reach, geometry_weight",
+        numbers.map(f64::from).into_iter(),
+    )?;
     let prior = slice(&prior, "prior")?;
     let params = RefineParams {
         iterations,

@@ -1,7 +1,7 @@
 //! Bindings of the mesh and texture kernels.
 
 use crate::checks::{finite, room, rows, shaped, within};
-use crate::convert::{array, picture, raster, run, slice};
+use crate::convert::{array, picture, raster, run, slice, unfit};
 use mvcore::atlas::Source;
 use mvcore::mesh::Mesh;
 use mvcore::select_views::{Photo, Rating, SelectParams};
@@ -10,7 +10,6 @@ use numpy::{
     PyArray1, PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
     PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 fn mesh<'a>(
@@ -102,7 +101,7 @@ pub fn build_atlas<'py>(
 {
     let ((v, f), labels) = (mesh(&vertices, &faces)?, slice(&labels, "labels")?);
     if matrices.len() != images.len() || gains.len() != images.len() {
-        return Err(PyValueError::new_err(format!("matrices, gains: expected {} of each", images.len())));
+        return Err(unfit(py, "matrices, gains", &format!("{} of each", images.len()), "others"));
     }
     let source = |n: usize| -> PyResult<Source> {
         Ok(Source { rgb: picture(&images[n], "rgb")?, projection: projection(&matrices[n])?, gain: gains[n] })
@@ -143,9 +142,8 @@ pub fn shade<'py>(
         || matrices.shape()[1..] != [3, 4]
         || textures.shape()[1..] != [size, size, 3]
     {
-        return Err(PyValueError::new_err(
-            "uv, normals, gloss, textures, matrices: expected shapes (n, 2), (n, 3), (m, 5), (m + 1, s, s, 3), (v, 3, 4)",
-        ));
+        let expected = "shapes (n, 2), (n, 3), (m, 5), (m + 1, s, s, 3), (v, 3, 4)";
+        return Err(unfit(py, "uv, normals, gloss, textures, matrices", expected, "others"));
     }
     let surface = Surface {
         uv: slice(&uv, "uv")?.as_chunks::<2>().0,

@@ -1,7 +1,7 @@
 //! Bindings of the consistency, fusion and surface kernels.
 
 use crate::checks::{check, finite, room, rows, shaped, within};
-use crate::convert::{array, map_of, raster, rasters, run, slice};
+use crate::convert::{array, map_of, raster, rasters, run, slice, unfit};
 use mvcore::carve::{CarveParams, Silhouette};
 use mvcore::consistency::{ConsistencyParams, OtherView};
 use mvcore::fuse::{FusionParams, FusionView};
@@ -88,8 +88,7 @@ pub fn fuse<'py>(
     let n = depths.len();
     let p = projections_of(&projections, n)?;
     if weights.len() != n || windows.len() != n || silhouettes.as_ref().is_some_and(|s| s.len() != n) {
-        let text = format!("weights, silhouettes, windows: expected {n} of each, as many as depths");
-        return Err(pyo3::exceptions::PyValueError::new_err(text));
+        return Err(unfit(py, "weights, silhouettes, windows", &format!("{n} of each, as many as depths"), "others"));
     }
     let views: Vec<FusionView> = (0..n)
         .map(|v| FusionView {
@@ -165,8 +164,7 @@ pub fn photo_carve<'py>(
 ) -> PyResult<Bound<'py, PyArray3<bool>>> {
     let projections = projections_of(&projections, low.len())?;
     if high.len() != low.len() || centers.len() != low.len() {
-        let text = format!("high, centers: expected {} of each, as many as low", low.len());
-        return Err(pyo3::exceptions::PyValueError::new_err(text));
+        return Err(unfit(py, "high, centers", &format!("{} of each, as many as low", low.len()), "others"));
     }
     let photo = |n: usize| {
         let (height, width, _) = low[n].as_array().dim();
@@ -189,8 +187,8 @@ pub fn photo_carve<'py>(
 fn projections_of(projections: &PyReadonlyArray3<'_, f64>, n: usize) -> PyResult<Vec<[f64; 12]>> {
     let p = projections.as_array();
     if p.dim() != (n, 3, 4) {
-        let text = format!("projections: expected shape ({n}, 3, 4), one a view, got {:?}", p.dim());
-        return Err(pyo3::exceptions::PyValueError::new_err(text));
+        let expected = format!("shape ({n}, 3, 4), one a view");
+        return Err(unfit(projections.py(), "projections", &expected, format!("{:?}", p.dim())));
     }
     finite(projections.py(), "projections", p.iter().copied())?;
     Ok((0..n).map(|v| std::array::from_fn(|k| p[(v, k / 4, k % 4)])).collect())

@@ -74,7 +74,11 @@ mod tests {
 
     #[test]
     fn more_than_there_is_has_no_room() {
-        assert!(room("image", &[640, 480, 3]).is_ok() && room("image", &[]).is_ok() && room("image", &[0, usize::MAX]).is_ok());
+        assert!(
+            room("image", &[640, 480, 3]).is_ok()
+                && room("image", &[]).is_ok()
+                && room("image", &[0, usize::MAX]).is_ok()
+        );
         for factors in [&[usize::MAX, 2][..], &[1 << 40, 1 << 6], &[usize::MAX]] {
             let error = room("image", factors).unwrap_err();
             assert!(error.to_string().starts_with("image needs"), "{error}");
