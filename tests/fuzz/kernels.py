@@ -207,7 +207,18 @@ class Fuzzer:
     def __call__(self, number: int) -> None:
         """Run a case."""
         _, function, arguments = self.call(number)
-        function(**arguments)
+        try:
+            function(**arguments)
+        except ValueError as error:
+            # The binding's own, for a sequence in place of a point: it never reaches a kernel.
+            if not str(error).startswith("expected a sequence of length"):
+                raise
+
+
+def _shown(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.size <= 12 else f"{value.dtype}{value.shape}"
+    return [_shown(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def main() -> int:
@@ -224,7 +235,7 @@ def main() -> int:
     print(outcome)
     for what, numbers in outcome.failures.items():
         name, _, arguments = fuzzer.call(numbers[0])
-        shown = {k: v.shape if isinstance(v, np.ndarray) and v.size > 20 else v for k, v in arguments.items()}
+        shown = {k: _shown(v) for k, v in arguments.items()}
         print(f"case {numbers[0]} ({name}): {what}\n  {shown!s:.1500}")
     return 1 if outcome.failures else 0
 

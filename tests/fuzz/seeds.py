@@ -71,6 +71,8 @@ def _mvsnet(folder: Path, scene) -> None:
     save_calibration(folder / "out", scene, "mvsnet")
     for part in (folder / "out").iterdir():
         part.rename(folder / part.name)
+    for n in range(COUNT):
+        (folder / "images" / f"{n:03d}.png").rename(folder / "images" / f"{n:08d}.png")
 
 
 def _nerf(folder: Path, scene) -> None:
@@ -145,6 +147,7 @@ def _kalibr(folder: Path, scene) -> None:
         text += f"  intrinsics: {[*map(float, c.K[[0, 1, 0, 1], [0, 1, 2, 2]])]}\n  resolution: [{c.width}, {c.height}]\n"
         text += "  T_cn_cnm1:\n" + "".join(f"  - {row}\n" for row in rows) if n else ""
         before = pose
+        (folder / f"{n}.png").rename(folder / f"cam{n}.png")
     (folder / "camchain.yaml").write_text(text)
 
 
