@@ -164,9 +164,10 @@ def _opencv(folder: Path, scene) -> None:
 
 def _stereo(folder: Path, scene) -> None:
     one = {"M1": scene.calib[0].K, "D1": np.zeros((1, 5)), "M2": scene.calib[1].K, "D2": np.zeros((1, 5))}
-    _storage(
-        folder / "stereo.yml", one | {"R": scene.calib[1].R, "T": scene.calib[1].t.reshape(3, 1), "image_width": 32, "image_height": 24}
-    )
+    pose = {"R": scene.calib[1].R, "T": scene.calib[1].t.reshape(3, 1), "image_width": 32, "image_height": 24}
+    _storage(folder / "stereo.yml", one | pose)
+    for n, name in enumerate(("left", "right")):
+        (folder / f"{n}.png").rename(folder / f"{name}.png")
 
 
 def files(folder: Path) -> dict[str, Path]:
