@@ -3,7 +3,10 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test build lint rust-test python-test bench peers format clean
+# Of each half of `make fuzz`.
+SECONDS ?= 120
+
+.PHONY: help demo test build lint rust-test rust-test-debug python-test fuzz bench peers format clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / — /'
@@ -17,7 +20,7 @@ $(VENV)/demo:
 	$(BIN)/pip install --quiet .
 	@touch $@
 
-test: lint rust-test python-test ## formatting, lints, Rust and Python tests
+test: lint rust-test rust-test-debug python-test ## formatting, lints, Rust and Python tests
 
 build: ## install into the environment with what the tests need
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -32,6 +35,13 @@ lint: build ## formatting and lints
 
 rust-test: ## tests of the kernels
 	cargo test --release --quiet --package mvcore
+
+rust-test-debug: ## the same with overflow checks and debug assertions
+	cargo test --quiet --package mvcore --lib
+
+fuzz: build ## mutated files for every reader, mad arguments for every kernel, SECONDS each (120); what fails is kept in out/fuzz
+	cd tests && ../$(BIN)/python -m fuzz.readers --seconds $(SECONDS) --seed $$(date +%s) --keep ../out/fuzz
+	cd tests && ../$(BIN)/python -m fuzz.kernels --seconds $(SECONDS) --seed $$(date +%s)
 
 python-test: build ## tests of the package
 	$(BIN)/python -m pytest -q tests

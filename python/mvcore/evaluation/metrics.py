@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
-from ..errors import FormatError, require
+from ..errors import require
 from ..geometry.cameras import Camera
+from ..io.mesh_files import load_mesh
 from ..types import Image
 
 Float = NDArray[np.float64]
@@ -34,15 +35,9 @@ def load_geometry(path: str | Path) -> Geometry:
     if path.suffix.lower() == ".obj":
         vertices, faces = _core.read_obj(str(path))
         return vertices, faces if len(faces) else None
-    import trimesh
-
-    try:
-        loaded = trimesh.load(path, process=False)
-    except (ValueError, KeyError, IndexError) as error:
-        raise FormatError(f"{path}: {error}") from None
-    merged = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
-    faces = getattr(merged, "faces", None)
-    vertices = np.asarray(merged.vertices, np.float64)
+    mesh = load_mesh(path)
+    faces = getattr(mesh, "faces", None)
+    vertices = np.asarray(mesh.vertices, np.float64)
     return vertices, None if faces is None or not len(faces) else np.asarray(faces, np.uint32)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError, require
 from .files import atomically
+from .limits import MOST_ARRAYS, read_bytes
 
 Map = NDArray[np.float32]
 
@@ -25,14 +26,14 @@ def write_pfm(path: str | Path, values: Map) -> None:
 def read_pfm(path: str | Path) -> Map:
     """(h, w) float32 of a one-channel PFM."""
     path = Path(path)
-    parts = path.read_bytes().split(b"\n", 3)
+    parts = read_bytes(path, MOST_ARRAYS).split(b"\n", 3)
     try:
         kind, size, scale, data = parts
         width, height = map(int, size.split())
         order = "<f4" if float(scale) < 0 else ">f4"
     except ValueError:
         raise FormatError(f"{path}:1: not a PFM file") from None
-    if kind.strip() != b"Pf" or len(data) < 4 * width * height:
+    if kind.strip() != b"Pf" or min(width, height) < 1 or len(data) < 4 * width * height:
         raise FormatError(f"{path}:1: not a complete one-channel PFM file")
     return np.frombuffer(data, order, width * height).reshape(height, width)[::-1].astype(np.float32)
 

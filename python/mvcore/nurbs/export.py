@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 Shape = Curve | Surface
 
+MOST_PIECES = 4096
+"""Chords of a span along an axis."""
+
 
 def tessellate(surface: Surface, tolerance: float, *, max_vertices: int = 4_000_000) -> tuple[Array, NDArray[np.int64], Array]:
     """Vertices (N, dim), triangles (F, 3) and parameters (N, 2) of a mesh nowhere farther than ``tolerance`` from the surface.
@@ -68,7 +71,9 @@ def _estimated(surface: Surface, axis: int, tolerance: float) -> Array:
     second = surface.derivatives_grid(pair[0], pair[1], 2)[(2, 0) if axis == 0 else (0, 2)]
     second = np.linalg.norm(second, axis=2)
     worst = (second.max(1) if axis == 0 else second.max(0)).reshape(along.shape).max(1)
-    pieces = np.ceil(np.diff(own) * np.sqrt(worst * 3 / (8 * tolerance))).clip(1, 4096).astype(int)
+    with np.errstate(over="ignore", invalid="ignore"):
+        wanted = np.ceil(np.diff(own) * np.sqrt(worst * 3 / (8 * tolerance)))
+    pieces = np.nan_to_num(wanted, nan=MOST_PIECES).clip(1, MOST_PIECES).astype(int)
     parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(own[:-1], own[1:], pieces, strict=True)]
     return np.concatenate([*parts, own[-1:]])
 

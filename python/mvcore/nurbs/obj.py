@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import FormatError, InvalidInputError, require
 from ..io.files import atomically
+from ..io.limits import MOST_ARRAYS, read_bytes
 from .checks import Array
 from .curve import Curve
 from .export import Shape
@@ -66,7 +67,7 @@ def load_obj(path: str | os.PathLike[str]) -> list[Shape]:
     vertices: list[list[float]] = []
     shapes: list[Shape] = []
     state: dict[str, Any] = {}
-    text = Path(path).read_text(errors="replace").replace("\\\n", " ")
+    text = read_bytes(Path(path), MOST_ARRAYS).decode("utf-8", "replace").replace("\\\n", " ")
     for line, content in enumerate(text.splitlines(), 1):
         word, *rest = content.split("#")[0].split() or [""]
         try:
@@ -82,6 +83,8 @@ def load_obj(path: str | os.PathLike[str]) -> list[Shape]:
                 state |= {"kind": word, "range": [float(x) for x in rest[:ends]], "line": line}
                 state["points"] = [vertices[k - 1 if k > 0 else len(vertices) + k] for k in picked]
             elif word == "parm":
+                if rest[0] not in ("u", "v"):
+                    raise ValueError(f"expected parm u or parm v, got parm {rest[0]:.20}")
                 state[rest[0]] = np.array([float(x) for x in rest[1:]])
             elif word == "end" and state.get("type") in (["bspline"], ["rat", "bspline"]) and "kind" in state:
                 shapes.append(_read_shape(state))

@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..io.files import atomically
+from ..io.limits import read_json
 from ..io.maps import colourise
 from ..pipeline.result import Reconstruction
 
 INDEX = "index.json"
+MOST_INDEX = 1 << 30
+"""Bytes of an index."""
 PICTURE = 480
 """Pixels of the longer side of depth pictures."""
 _TIMED = ("seconds", "tasks", "peak_memory_mib")
@@ -79,10 +82,7 @@ def read_index(folder: str | Path) -> dict[str, Any]:
     path = Path(folder) / INDEX
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such index; is this the output of a finished 'mvcore video'?")
-    try:
-        index = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise FormatError(f"{path}: {error}") from None
+    index = read_json(path, MOST_INDEX)
     if not isinstance(index, dict) or index.get("format") != "mvcore sequence":
         raise FormatError(f"{path}: not the index of a sequence")
     return index

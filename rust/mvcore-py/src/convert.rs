@@ -25,19 +25,24 @@ fn to_python(py: Python<'_>, error: &Error) -> PyErr {
     raised.map_or_else(|_| PyValueError::new_err(error.to_string()), PyErr::from_value)
 }
 
+/// The error of an argument that does not fit its contract.
+pub fn unfit(py: Python<'_>, argument: &'static str, expected: &str, got: impl std::fmt::Display) -> PyErr {
+    to_python(py, &Error::InvalidInput { argument, expected: expected.to_owned(), got: got.to_string() })
+}
+
 /// A contiguous array's values, or an error naming the argument.
 pub fn slice<'a, T: Element, D: Dimension>(
     array: &'a PyReadonlyArray<'_, T, D>,
     argument: &'static str,
 ) -> PyResult<&'a [T]> {
     let values = array.as_slice().ok().filter(|_| array.is_c_contiguous());
-    values.ok_or_else(|| PyValueError::new_err(format!("{argument}: expected a C-contiguous array")))
+    values.ok_or_else(|| unfit(array.py(), argument, "a C-contiguous array", "another"))
 }
 
 /// A picture (h, w, 3) as a raster of its bytes, 3 w a row.
 pub fn picture<'a>(array: &'a PyReadonlyArray3<'_, u8>, argument: &'static str) -> PyResult<Raster<'a, u8>> {
     let [h, w, 3] = *array.shape() else {
-        return Err(PyValueError::new_err(format!("{argument}: expected shape (h, w, 3)")));
+        return Err(unfit(array.py(), argument, "shape (h, w, 3)", format!("{:?}", array.shape())));
     };
     Raster::new(slice(array, argument)?, 3 * w, h, argument).map_err(|error| to_python(array.py(), &error))
 }
@@ -58,9 +63,10 @@ pub fn rasters<'a, T: Element>(
 
 /// An (n, 12) array as maps between views: nine values of the matrix, three of the offset.
 pub fn map_of(maps: &PyReadonlyArray2<'_, f32>, n: usize, argument: &'static str) -> PyResult<Vec<Epipolar>> {
+    let py = maps.py();
     let maps = maps.as_array();
     if maps.dim() != (n, 12) {
-        return Err(PyValueError::new_err(format!("{argument}: expected shape ({n}, 12), got {:?}", maps.dim())));
+        return Err(unfit(py, argument, &format!("shape ({n}, 12)"), format!("{:?}", maps.dim())));
     }
     let map = |i: usize| Epipolar {
         matrix: std::array::from_fn(|k| maps[(i, k)]),

@@ -1,6 +1,7 @@
 //! Bindings of the depth kernels.
 
-use crate::convert::{array, map_of, picture, raster, rasters, run, slice, sources};
+use crate::checks::{check, finite, room, shaped, within};
+use crate::convert::{array, map_of, picture, raster, rasters, run, slice, sources, unfit};
 use mvcore::aggregate::Penalties;
 use mvcore::correlate::{Features, Planes, Visibility};
 use mvcore::median::MedianParams;
@@ -9,8 +10,10 @@ use numpy::{
     PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArrayDyn,
     PyReadwriteArray3, PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+
+/// Of `refine`; a dozen are common.
+const MOST_ITERATIONS: f64 = 1000.0;
 
 #[pyfunction]
 #[pyo3(signature = (reference, images, maps, planes, best = 0))]
@@ -24,6 +27,7 @@ pub fn sweep<'py>(
 ) -> PyResult<Bound<'py, PyArray3<u8>>> {
     let (reference, views) = (raster(&reference, "reference")?, sources(&images, &maps)?);
     let planes = slice(&planes, "planes")?;
+    room(py, "costs", &[reference.height, reference.width, planes.len()])?;
     let costs = run(py, || mvcore::sweep::sweep(reference, &views, planes, best))?;
     array(py, costs, [reference.height, reference.width, planes.len()])
 }
@@ -38,6 +42,9 @@ pub fn aggregate<'py>(
     p2_falloff: u8,
 ) -> PyResult<(Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>)> {
     let guide = raster(&guide, "guide")?;
+    shaped(py, "costs", &costs.shape()[..2], &[guide.height, guide.width])?;
+    // The paths' sums of two bytes, and what each direction keeps.
+    room(py, "path costs", &[guide.height, guide.width, costs.shape()[2], 4])?;
     let (planes, values) = (costs.shape()[2], slice(&costs, "costs")?);
     let penalties = Penalties { p1, p2, p2_falloff };
     let winners = run(py, || mvcore::aggregate::aggregate(values, planes, guide, penalties))?;
@@ -56,8 +63,10 @@ pub fn expect<'py>(
     reach: f32,
 ) -> PyResult<()> {
     let planes = costs.shape()[2];
+    shaped(py, "expected", expected.shape(), &costs.shape()[..2])?;
+    shaped(py, "confidence", confidence.shape(), &costs.shape()[..2])?;
     let (expected, confidence) = (slice(&expected, "expected")?, slice(&confidence, "confidence")?);
-    let values = costs.as_slice_mut().map_err(|_| PyValueError::new_err("costs: expected a C-contiguous array"))?;
+    let values = costs.as_slice_mut().map_err(|_| unfit(py, "costs", "a C-contiguous array", "another"))?;
     run(py, || mvcore::expect::expect(values, planes, expected, confidence, weight, reach))
 }
 
@@ -77,6 +86,7 @@ pub fn weighted_median<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let (values, doubtful) = (raster(&values, "values")?, raster(&doubtful, "doubtful")?);
     let guide = picture(&guide, "guide")?;
+    finite(py, "colour, distance, slack", [colour, distance, slack].map(f64::from).into_iter())?;
     let params = MedianParams { radius, step, colour, distance, slack };
     let found = run(py, || mvcore::median::weighted_median(values, guide, doubtful, &params))?;
     array(py, found, [values.height, values.width])
@@ -105,6 +115,11 @@ pub fn correlate<'py>(
         .collect::<PyResult<_>>()?;
     let values = slice(&planes, "planes")?;
     let count = planes.shape().first().copied().unwrap_or(0);
+    let whole = planes.shape() == [count] || planes.shape() == [count, height, width];
+    let expected = format!("shape (D,) or (D, {height}, {width})");
+    check(py, whole, "planes", &expected, format!("{:?}", planes.shape()))?;
+    check(py, height > 0 && width > 0, "reference", "a non-empty array", format!("{height} x {width}"))?;
+    room(py, "correlations", &[count, height, width, gain.shape()[0], size_of::<f32>()])?;
     let swept = if planes.shape().len() == 1 { Planes::Common(values) } else { Planes::Own(values, count) };
     let gain = slice(&gain, "gain")?;
     let out = run(py, || mvcore::correlate::correlate(first, &views, swept, Visibility { gain, bias }))?;
@@ -138,8 +153,18 @@ pub fn refine<'py>(
         .zip(map_of(&backs, depths.len(), "backs")?)
         .map(|(depth, back)| SourceSurface { depth, back })
         .collect();
+    let init_shape = init.shape().to_vec();
     let init: Vec<Hypothesis> =
         slice(&init, "init")?.chunks_exact(4).map(|h| Hypothesis { w: h[0], a: h[1], b: h[2], cost: h[3] }).collect();
+    shaped(py, "init", &init_shape, &[reference.height, reference.width, 4])?;
+    shaped(py, "prior", prior.shape(), &[reference.height, reference.width])?;
+    within(py, "iterations", iterations as f64, 0.0, MOST_ITERATIONS)?;
+    let numbers = [low, high, step, max_slope, prior_weight, prior_reach, geometry_weight];
+    finite(
+        py,
+        "low, high, step, max_slope, prior_weight, prior_reach, geometry_weight",
+        numbers.map(f64::from).into_iter(),
+    )?;
     let prior = slice(&prior, "prior")?;
     let params = RefineParams {
         iterations,

@@ -1,5 +1,6 @@
 //! The Python module `mvcore._core`: check, borrow, detach, call, convert. Nothing is computed here.
 
+mod checks;
 mod convert;
 mod depth;
 mod files;

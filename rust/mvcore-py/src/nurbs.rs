@@ -1,7 +1,9 @@
 //! NURBS kernels: control nets, knots and parameters in; points, derivatives and gradients out.
 
+use crate::checks::check;
 use crate::convert::{array, run, slice};
 use mvcore::error::require;
+use mvcore::memory;
 use mvcore::nurbs::{self, Derivative, Knots, Net};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArray4, PyArray5, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -78,6 +80,7 @@ pub fn nurbs_surface<'py>(
         let net = Net::new("control_points", control, m, n, dim, rational)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
         let wanted = nurbs::triangle(order)?;
+        memory::room("points", &[wanted.len() * 2, u.len(), net.dim_out(), size_of::<f64>()])?;
         Ok((nurbs::surface_points(&net, knots, u, v, &wanted, (order + 1) * (order + 1))?, net.dim_out()))
     })?;
     array(py, out, (order + 1, order + 1, u.len(), dim))
@@ -124,6 +127,8 @@ pub fn nurbs_surface_grid<'py>(
     let (out, dim) = run(py, || {
         let net = Net::new("control_points", control, m, n, dim, rational)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
+        let orders = order.saturating_add(1).saturating_mul(order.saturating_add(1));
+        memory::room("points", &[orders, u.len(), v.len(), net.dim_out(), size_of::<f64>()])?;
         Ok((nurbs::surface_grid(&net, knots, u, v, order)?, net.dim_out()))
     })?;
     array(py, out, (order + 1, order + 1, u.len(), v.len(), dim))
@@ -141,10 +146,12 @@ pub fn nurbs_control_gradient<'py>(
     orders: (usize, usize),
 ) -> PyResult<Bound<'py, PyArray3<f64>>> {
     let dim = gradient.shape()[1];
+    check(py, dim > 0, "gradient", "at least one coordinate", dim)?;
     let (ku, kv) = (slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v, gradient) = (slice(&u, "u")?, slice(&v, "v")?, slice(&gradient, "gradient")?);
     let out = run(py, || {
         let knots = [&Knots::new("knots_u", ku, counts.0)?, &Knots::new("knots_v", kv, counts.1)?];
+        memory::room("gradient", &[counts.0, counts.1, dim, size_of::<f64>()])?;
         nurbs::control_gradient(knots, u, v, gradient, dim, [orders.0, orders.1])
     })?;
     array(py, out, (counts.0, counts.1, dim))
@@ -161,6 +168,7 @@ pub fn nurbs_curve_control_gradient<'py>(
     order: usize,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let dim = gradient.shape()[1];
+    check(py, dim > 0, "gradient", "at least one coordinate", dim)?;
     let (knots, u, gradient) = (slice(&knots, "knots")?, slice(&u, "u")?, slice(&gradient, "gradient")?);
     let out = run(py, || nurbs::curve_control_gradient(&Knots::new("knots", knots, count)?, u, gradient, dim, order))?;
     array(py, out, (count, dim))

@@ -1,9 +1,9 @@
 //! Binding of the guided matcher.
 
+use crate::checks::{check, finite, rows, shaped, within};
 use crate::convert::{array, run, slice};
 use mvcore::match_epipolar::{DESCRIPTOR, Features};
-use numpy::{PyArray2, PyReadonlyArray2};
-use pyo3::exceptions::PyValueError;
+use numpy::{PyArray2, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
 #[pyfunction]
@@ -19,9 +19,11 @@ pub fn match_epipolar<'py>(
 ) -> PyResult<Bound<'py, PyArray2<u32>>> {
     let a = features(&positions_a, &descriptors_a)?;
     let b = features(&positions_b, &descriptors_b)?;
-    let f: [f64; 9] = slice(&fundamental, "fundamental")?
-        .try_into()
-        .map_err(|_| PyValueError::new_err("fundamental: expected shape (3, 3)"))?;
+    shaped(py, "fundamental", fundamental.shape(), &[3, 3])?;
+    let mut f = [0.0; 9];
+    f.copy_from_slice(slice(&fundamental, "fundamental")?);
+    finite(py, "fundamental", f.iter().copied())?;
+    within(py, "ratio", f64::from(ratio), 0.0, 1.0)?;
     let pairs = run(py, || mvcore::match_epipolar::match_epipolar(a, b, &f, band, ratio))?;
     let n = pairs.len();
     array(py, pairs.into_flattened(), [n, 2])
@@ -31,11 +33,11 @@ fn features<'a>(
     positions: &'a PyReadonlyArray2<'_, f32>,
     descriptors: &'a PyReadonlyArray2<'_, u8>,
 ) -> PyResult<Features<'a>> {
-    if positions.as_array().dim().1 != 2 || descriptors.as_array().dim().1 != DESCRIPTOR {
-        return Err(PyValueError::new_err("positions, descriptors: expected shapes (n, 2) and (n, 128)"));
-    }
-    Ok(Features {
-        positions: slice(positions, "positions")?.as_chunks::<2>().0,
-        descriptors: slice(descriptors, "descriptors")?.as_chunks::<DESCRIPTOR>().0,
-    })
+    let features = Features {
+        positions: rows::<2, _>(positions, "positions")?,
+        descriptors: rows::<DESCRIPTOR, _>(descriptors, "descriptors")?,
+    };
+    let fits = u32::try_from(features.positions.len()).is_ok();
+    check(positions.py(), fits, "positions", "fewer than 2^32", features.positions.len())?;
+    Ok(features)
 }

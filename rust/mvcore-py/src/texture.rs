@@ -1,6 +1,7 @@
 //! Bindings of the mesh and texture kernels.
 
-use crate::convert::{array, picture, raster, run, slice};
+use crate::checks::{finite, room, rows, shaped, within};
+use crate::convert::{array, picture, raster, run, slice, unfit};
 use mvcore::atlas::Source;
 use mvcore::mesh::Mesh;
 use mvcore::select_views::{Photo, Rating, SelectParams};
@@ -9,21 +10,21 @@ use numpy::{
     PyArray1, PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
     PyUntypedArrayMethods,
 };
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 fn mesh<'a>(
     vertices: &'a PyReadonlyArray2<'_, f64>,
     faces: &'a PyReadonlyArray2<'_, u32>,
 ) -> PyResult<(&'a [[f64; 3]], &'a [[u32; 3]])> {
-    if vertices.shape()[1] != 3 || faces.shape()[1] != 3 {
-        return Err(PyValueError::new_err("vertices, faces: expected shape (n, 3)"));
-    }
-    Ok((slice(vertices, "vertices")?.as_chunks::<3>().0, slice(faces, "faces")?.as_chunks::<3>().0))
+    Ok((rows::<3, _>(vertices, "vertices")?, rows::<3, _>(faces, "faces")?))
 }
 
 fn projection(p: &PyReadonlyArray2<'_, f64>) -> PyResult<[f64; 12]> {
-    slice(p, "projection")?.try_into().map_err(|_| PyValueError::new_err("projection: expected shape (3, 4)"))
+    shaped(p.py(), "projection", p.shape(), &[3, 4])?;
+    let mut out = [0.0; 12];
+    out.copy_from_slice(slice(p, "projection")?);
+    finite(p.py(), "projection", out.iter().copied())?;
+    Ok(out)
 }
 
 #[pyfunction]
@@ -36,6 +37,7 @@ pub fn rasterize<'py>(
     height: usize,
 ) -> PyResult<(Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<i32>>)> {
     let ((v, f), p) = (mesh(&vertices, &faces)?, projection(&matrix)?);
+    room(py, "depth and faces", &[height, width, 8])?;
     let (depth, face) = run(py, || mvcore::rasterize::rasterize(Mesh::new(v, f)?, &p, width, height))?;
     Ok((array(py, depth, [height, width])?, array(py, face, [height, width])?))
 }
@@ -99,7 +101,7 @@ pub fn build_atlas<'py>(
 {
     let ((v, f), labels) = (mesh(&vertices, &faces)?, slice(&labels, "labels")?);
     if matrices.len() != images.len() || gains.len() != images.len() {
-        return Err(PyValueError::new_err(format!("matrices, gains: expected {} of each", images.len())));
+        return Err(unfit(py, "matrices, gains", &format!("{} of each", images.len()), "others"));
     }
     let source = |n: usize| -> PyResult<Source> {
         Ok(Source { rgb: picture(&images[n], "rgb")?, projection: projection(&matrices[n])?, gain: gains[n] })
@@ -140,9 +142,8 @@ pub fn shade<'py>(
         || matrices.shape()[1..] != [3, 4]
         || textures.shape()[1..] != [size, size, 3]
     {
-        return Err(PyValueError::new_err(
-            "uv, normals, gloss, textures, matrices: expected shapes (n, 2), (n, 3), (m, 5), (m + 1, s, s, 3), (v, 3, 4)",
-        ));
+        let expected = "shapes (n, 2), (n, 3), (m, 5), (m + 1, s, s, 3), (v, 3, 4)";
+        return Err(unfit(py, "uv, normals, gloss, textures, matrices", expected, "others"));
     }
     let surface = Surface {
         uv: slice(&uv, "uv")?.as_chunks::<2>().0,
@@ -154,6 +155,8 @@ pub fn shade<'py>(
     };
     let projections = slice(&matrices, "matrices")?.as_chunks::<12>().0;
     let shots = Shots { projections, lamp, width, height, samples };
+    room(py, "images", &[projections.len(), height, width, 3])?;
+    within(py, "samples", samples as f64, 1.0, 8.0)?;
     let images = run(py, || mvcore::shade::shade(Mesh::new(v, f)?, surface, &shots))?;
     array(py, images, [projections.len(), height, width, 3])
 }

@@ -1,14 +1,24 @@
 //! Bindings of the consistency, fusion and surface kernels.
 
-use crate::convert::{array, map_of, raster, rasters, run, slice};
+use crate::checks::{check, finite, room, rows, shaped, within};
+use crate::convert::{array, map_of, raster, rasters, run, slice, unfit};
 use mvcore::carve::{CarveParams, Silhouette};
 use mvcore::consistency::{ConsistencyParams, OtherView};
 use mvcore::fuse::{FusionParams, FusionView};
 use mvcore::grid::{BlockMap, Grid, SIDE, Tile};
 use mvcore::isosurface::Surface;
 use mvcore::photo_carve::{Photo, PhotoParams};
-use numpy::{PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4};
+use numpy::{
+    PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4, PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
+
+/// Voxels of a truncation distance; four or so are common.
+const MOST_TRUNCATION: f64 = 1000.0;
+/// Voxels of a standard deviation of smoothing: its window is that of one block around another.
+const MOST_SMOOTHING: f64 = 8.0;
+/// Of photo-carving; it ends before where nothing changes.
+const MOST_ROUNDS: f64 = 1000.0;
 
 type Filtered<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<u8>>);
 type Triangles<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<u32>>);
@@ -25,6 +35,7 @@ pub fn consistency<'py>(
     depth_unit: f32,
 ) -> PyResult<Filtered<'py>> {
     let depth = raster(&depth, "depth")?;
+    finite(py, "pixel_unit, depth_unit", [pixel_unit, depth_unit].map(f64::from).into_iter())?;
     let (there, back) = (map_of(&there, others.len(), "there")?, map_of(&back, others.len(), "back")?);
     let views: Vec<OtherView> = rasters(&others, "others")?
         .into_iter()
@@ -61,13 +72,23 @@ pub fn fuse<'py>(
     hollow: bool,
     max_memory: usize,
 ) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray4<f32>>)> {
+    finite(py, "origin, voxel, truncation", origin.into_iter().chain([voxel, truncation]))?;
+    finite(py, "windows", windows.iter().flatten().copied())?;
+    // Rays are walked in thirds of a block over twice this distance.
+    check(py, truncation <= MOST_TRUNCATION * voxel, "truncation", "at most 1000 voxels", truncation)?;
+    within(py, "smoothing", f64::from(smoothing), 0.0, MOST_SMOOTHING)?;
+    within(py, "measured_smoothing", f64::from(measured_smoothing), 0.0, MOST_SMOOTHING)?;
+    finite(
+        py,
+        "free_weight, min_weight, solid_weight, hull_tolerance",
+        [free_weight, min_weight, solid_weight, hull_tolerance].map(f64::from).into_iter(),
+    )?;
     let (depths, weights) = (rasters(&depths, "depths")?, rasters(&weights, "weights")?);
     let silhouettes = silhouettes.as_ref().map(|s| rasters(s, "silhouettes")).transpose()?;
     let n = depths.len();
     let p = projections_of(&projections, n)?;
     if weights.len() != n || windows.len() != n || silhouettes.as_ref().is_some_and(|s| s.len() != n) {
-        let text = format!("weights, silhouettes, windows: expected {n} of each, as many as depths");
-        return Err(pyo3::exceptions::PyValueError::new_err(text));
+        return Err(unfit(py, "weights, silhouettes, windows", &format!("{n} of each, as many as depths"), "others"));
     }
     let views: Vec<FusionView> = (0..n)
         .map(|v| FusionView {
@@ -119,6 +140,7 @@ pub fn carve<'py>(
     let projections = projections_of(&projections, masks.len())?;
     let views: Vec<Silhouette> =
         masks.into_iter().zip(projections).map(|(mask, projection)| Silhouette { mask, projection }).collect();
+    room(py, "voxels", &[shape[0], shape[1], shape[2], 2])?;
     let params = CarveParams { tolerance, least_views };
     let inside = run(py, || mvcore::carve::carve(Grid::new(origin, voxel, shape)?, &views, &params))?;
     array(py, inside, shape)
@@ -142,15 +164,18 @@ pub fn photo_carve<'py>(
 ) -> PyResult<Bound<'py, PyArray3<bool>>> {
     let projections = projections_of(&projections, low.len())?;
     if high.len() != low.len() || centers.len() != low.len() {
-        let text = format!("high, centers: expected {} of each, as many as low", low.len());
-        return Err(pyo3::exceptions::PyValueError::new_err(text));
+        return Err(unfit(py, "high, centers", &format!("{} of each, as many as low", low.len()), "others"));
     }
     let photo = |n: usize| {
         let (height, width, _) = low[n].as_array().dim();
+        shaped(py, "low", low[n].shape(), &[height, width, 3])?;
+        shaped(py, "high", high[n].shape(), &[height, width, 3])?;
         let (low, high) = (slice(&low[n], "low")?, slice(&high[n], "high")?);
         PyResult::Ok(Photo { low, high, width, height, projection: projections[n], center: centers[n] })
     };
     let photos = (0..low.len()).map(photo).collect::<PyResult<Vec<_>>>()?;
+    within(py, "rounds", rounds as f64, 0.0, MOST_ROUNDS)?;
+    finite(py, "centers", centers.iter().flatten().copied())?;
     let shape: [usize; 3] = occupied.as_array().dim().into();
     let mut kept = slice(&occupied, "occupied")?.to_vec();
     let params = PhotoParams { threshold, least_views, rounds };
@@ -162,15 +187,17 @@ pub fn photo_carve<'py>(
 fn projections_of(projections: &PyReadonlyArray3<'_, f64>, n: usize) -> PyResult<Vec<[f64; 12]>> {
     let p = projections.as_array();
     if p.dim() != (n, 3, 4) {
-        let text = format!("projections: expected shape ({n}, 3, 4), one a view, got {:?}", p.dim());
-        return Err(pyo3::exceptions::PyValueError::new_err(text));
+        let expected = format!("shape ({n}, 3, 4), one a view");
+        return Err(unfit(projections.py(), "projections", &expected, format!("{:?}", p.dim())));
     }
+    finite(projections.py(), "projections", p.iter().copied())?;
     Ok((0..n).map(|v| std::array::from_fn(|k| p[(v, k / 4, k % 4)])).collect())
 }
 
 #[pyfunction]
 pub fn isosurface_dense<'py>(py: Python<'py>, values: PyReadonlyArray3<'py, f32>) -> PyResult<Triangles<'py>> {
     let (a, b, c) = values.as_array().dim();
+    check(py, a > 0 && b > 0 && c > 0, "values", "at least one sample along each axis", format!("{:?}", [a, b, c]))?;
     let samples = slice(&values, "values")?;
     triangles(py, run(py, || mvcore::isosurface::isosurface_dense(samples, [a, b, c]))?)
 }
@@ -182,7 +209,15 @@ pub fn isosurface_sparse<'py>(
     values: PyReadonlyArray4<'py, f32>,
 ) -> PyResult<Triangles<'py>> {
     let samples = slice(&values, "values")?;
-    let coords = slice(&coords, "coords")?.as_chunks::<3>().0.to_vec();
+    let coords = rows::<3, _>(&coords, "coords")?.to_vec();
+    shaped(py, "values", values.shape(), &[coords.len(), SIDE, SIDE, SIDE])?;
+    let end = coords.iter().flatten().max().copied().unwrap_or(0);
+    check(py, end < 1 << 28, "coords", "block coordinates below 2^28", end)?;
+    let extent = |a: usize| {
+        let low = coords.iter().map(|c| c[a]).min().unwrap_or(0);
+        coords.iter().map(|c| c[a]).max().map_or(0, |high| (high - low) as usize + 1)
+    };
+    room(py, "block table", &[extent(0), extent(1), extent(2), size_of::<u32>()])?;
     let kernel = || mvcore::isosurface::isosurface_sparse(&BlockMap::from_coords(coords)?, samples);
     triangles(py, run(py, kernel)?)
 }
@@ -198,7 +233,8 @@ pub fn components<'py>(
     py: Python<'py>,
     faces: PyReadonlyArray2<'py, u32>,
 ) -> PyResult<Bound<'py, numpy::PyArray1<u32>>> {
-    let faces = slice(&faces, "faces")?.as_chunks::<3>().0;
+    let faces = rows::<3, _>(&faces, "faces")?;
+    check(py, i32::try_from(3 * faces.len()).is_ok(), "faces", "fewer than 2^29", faces.len())?;
     let part = run(py, || Ok(mvcore::mesh::components(&mvcore::mesh::neighbours(faces), |_, _| true).0))?;
     let n = part.len();
     array(py, part, [n])
@@ -212,8 +248,7 @@ pub fn close_holes<'py>(
     faces: PyReadonlyArray2<'py, u32>,
     most_edges: usize,
 ) -> PyResult<Bound<'py, numpy::PyArray2<u32>>> {
-    let vertices = slice(&vertices, "vertices")?.as_chunks::<3>().0;
-    let faces = slice(&faces, "faces")?.as_chunks::<3>().0;
+    let (vertices, faces) = (rows::<3, _>(&vertices, "vertices")?, rows::<3, _>(&faces, "faces")?);
     let kernel = || mvcore::holes::close_holes(mvcore::mesh::Mesh::new(vertices, faces)?, most_edges);
     let added = run(py, kernel)?;
     let n = added.len();
@@ -228,8 +263,7 @@ pub fn nearest<'py>(
     others: PyReadonlyArray2<'py, f64>,
     reach: f64,
 ) -> PyResult<(Bound<'py, numpy::PyArray1<f64>>, Bound<'py, numpy::PyArray1<i64>>)> {
-    let p = slice(&points, "points")?.as_chunks::<3>().0;
-    let q = slice(&others, "others")?.as_chunks::<3>().0;
+    let (p, q) = (rows::<3, _>(&points, "points")?, rows::<3, _>(&others, "others")?);
     let (distances, numbers) = run(py, || mvcore::nearest::nearest(p, q, reach))?;
     let n = distances.len();
     Ok((array(py, distances, [n])?, array(py, numbers, [n])?))

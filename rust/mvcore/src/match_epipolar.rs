@@ -117,7 +117,7 @@ mod tests {
 
     #[test]
     fn the_twin_on_the_line_is_taken_and_the_better_one_off_it_is_not() {
-        let describe = |seed: u8| std::array::from_fn(|k| seed.wrapping_mul(31).wrapping_add(k as u8 * 3) / 4);
+        let describe = |seed: u8| std::array::from_fn(|k| seed.wrapping_mul(31).wrapping_add((k as u8).wrapping_mul(3)) / 4);
         let mut near = describe(1);
         near[0] += 20;
         let a = Features { positions: &[[10., 20.]], descriptors: &[describe(1)] };

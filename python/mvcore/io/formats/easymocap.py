@@ -6,12 +6,13 @@ Image sizes come from ``H_CAM`` and ``W_CAM`` where they are given, else from ``
 from __future__ import annotations
 
 from pathlib import Path
-
-import cv2
+from typing import Any
 
 from ...errors import FormatError
 from ..media import media_size
-from .opencv import open_storage, storage_value
+from .camera_folders import camera_image, plain_name
+from .filestorage import read_filestorage
+from .opencv import rotation_of, storage_distortion, storage_matrix, storage_size
 from .records import Found, Record
 
 INTRINSIC, EXTRINSIC = "intri.yml", "extri.yml"
@@ -26,31 +27,31 @@ def find(path: Path) -> Path | None:
 
 def read(path: Path) -> Found:
     """The cameras in the order of the file's ``names``."""
-    with open_storage(path / INTRINSIC) as intrinsic, open_storage(path / EXTRINSIC) as extrinsic:
-        names = intrinsic.getNode("names")
-        if names.empty() or not names.isSeq():
-            raise FormatError(f"{path / INTRINSIC}: expected a list 'names'")
-        cameras = [_name(names.at(n)) for n in range(names.size())]
-        return Found([_record(path, c, intrinsic, extrinsic) for c in cameras], path)
+    intrinsic, extrinsic = read_filestorage(path / INTRINSIC), read_filestorage(path / EXTRINSIC)
+    names = intrinsic.get("names")
+    if not isinstance(names, list) or not all(isinstance(n, str | int | float) and plain_name(str(n)) for n in names):
+        raise FormatError(f"{path / INTRINSIC}: expected a list 'names' of cameras")
+    return Found([_record(path, str(n), intrinsic, extrinsic) for n in names], path)
 
 
-def _name(node: cv2.FileNode) -> str:
-    # Unquoted digits are read as a number.
-    return node.string() if node.isString() else f"{node.real():g}"
-
-
-def _record(path: Path, name: str, intrinsic: cv2.FileStorage, extrinsic: cv2.FileStorage) -> Record:
+def _record(path: Path, name: str, intrinsic: dict[str, Any], extrinsic: dict[str, Any]) -> Record:
     inside, outside = path / INTRINSIC, path / EXTRINSIC
-    matrix = storage_value(inside, intrinsic, (f"K_{name}",))
-    t = storage_value(outside, extrinsic, (f"T_{name}",))
-    rotation = storage_value(outside, extrinsic, (f"Rot_{name}",))
-    if rotation is None and (vector := storage_value(outside, extrinsic, (f"R_{name}",))) is not None:
-        rotation = cv2.Rodrigues(vector.reshape(3, 1))[0]
+    matrix = storage_matrix(inside, intrinsic, (f"K_{name}",), (9,))
+    t = storage_matrix(outside, extrinsic, (f"T_{name}",), (3,))
+    rotation = storage_matrix(outside, extrinsic, (f"Rot_{name}", f"R_{name}"), (3, 9))
     for file, key, value in ((inside, f"K_{name}", matrix), (outside, f"R_{name}", rotation), (outside, f"T_{name}", t)):
         if value is None:
             raise FormatError(f"{file}: {key} missing")
-    distortion = storage_value(inside, intrinsic, (f"dist_{name}", f"D_{name}"))
-    width, height = (storage_value(inside, intrinsic, (f"{a}_{name}",)) for a in "WH")
-    size = (int(width), int(height)) if width and height else media_size(path, name)
-    values = [] if distortion is None else distortion.reshape(-1).tolist()
-    return Record(K=matrix, R=rotation, t=t.reshape(-1), width=size[0], height=size[1], name=name, distortion=values if any(values) else ())
+    width, height = storage_size(inside, intrinsic, (f"W_{name}",), (f"H_{name}",))
+    if not width:
+        width, height = media_size(path, name)
+    return Record(
+        K=matrix.reshape(3, 3),
+        R=rotation_of(rotation),
+        t=t.reshape(-1),
+        width=width,
+        height=height,
+        image=camera_image(path, name),
+        name=name,
+        distortion=storage_distortion(inside, intrinsic, (f"dist_{name}", f"D_{name}")),
+    )

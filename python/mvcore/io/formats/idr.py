@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-import zipfile
+import re
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import FormatError, InvalidInputError
 from ...geometry.cameras import Camera
-from .records import IMAGE_SUFFIXES, Found, Record
+from ..limits import read_npz
+from ..media import frame_files
+from .records import Found, Record
 
 NAMES = ("cameras_sphere.npz", "cameras_large.npz", "cameras.npz")
+KEY = re.compile(r"(?:world|scale)_mat_[0-9]{1,9}")
+NUMBER = re.compile(r"[0-9]{1,9}")
+MOST = 64 << 20
+"""Bytes of the matrices of an archive."""
 
 
 def find(path: Path) -> Path | None:
@@ -22,40 +28,45 @@ def find(path: Path) -> Path | None:
 
 
 def read(path: Path) -> Found:
-    """The views of an archive; images are taken in the order of their names."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {k: archive[k] for k in archive.files if k.startswith(("world_mat_", "scale_mat_"))}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{path}: {error}") from None
-    count = 0
-    while f"world_mat_{count}" in arrays:
-        count += 1
-    images = _images(path.parent)
-    if images and len(images) != count:
-        raise FormatError(f"{path}: {count} cameras, but {len(images)} images beside it")
+    """The views of an archive by number, each with the image of that number, or images in the order of their names."""
+    arrays = read_npz(path, lambda name: KEY.fullmatch(name) is not None, MOST)
+    numbers = sorted(int(name.removeprefix("world_mat_")) for name in arrays if name.startswith("world_mat_"))
+    images = _images(path, numbers)
     records = []
-    for n in range(count):
+    for n in numbers:
+        matrix = arrays[f"world_mat_{n}"]
+        if matrix.shape not in ((3, 4), (4, 4)):
+            raise FormatError(f"{path}: world_mat_{n}: expected 4 x 4 numbers, got shape {matrix.shape}")
         try:
             # Size 1 x 1: the decomposition does not need it, the image's header gives it.
-            camera = Camera.from_projection(arrays[f"world_mat_{n}"][:3, :4], 1, 1)
-        except (InvalidInputError, IndexError) as error:
+            camera = Camera.from_projection(matrix[:3].astype(np.float64), 1, 1)
+        except (InvalidInputError, np.linalg.LinAlgError) as error:
             raise FormatError(f"{path}: world_mat_{n}: {error}") from None
-        image = images[n] if images else None
+        image = images.get(n)
         records.append(Record(K=camera.K, R=camera.R, t=camera.t, image=image, name=image.name if image else f"{n:06d}"))
-    return Found(records, path, _bounds(arrays.get("scale_mat_0")))
+    return Found(records, path, _bounds(arrays.get(f"scale_mat_{numbers[0]}")) if numbers else None)
 
 
-def _images(folder: Path) -> list[Path]:
+def _images(path: Path, numbers: list[int]) -> dict[int, Path]:
+    """An image for each number, or none at all where there are no images."""
+    folder = path.parent
     for base in (folder / "image", folder / "images", folder):
-        files = sorted(f for f in base.glob("*") if f.suffix.lower() in IMAGE_SUFFIXES) if base.is_dir() else []
-        if files:
-            return files
-    return []
+        files = frame_files(base) if base.is_dir() else []
+        files = [f for f in files if not f.name.startswith(".")]
+        if not files:
+            continue
+        by_number = {int(f.stem): f for f in files if NUMBER.fullmatch(f.stem)}
+        if all(n in by_number for n in numbers):
+            return {n: by_number[n] for n in numbers}
+        if len(files) == len(numbers):
+            return dict(zip(numbers, files, strict=True))
+        raise FormatError(f"{path}: {len(numbers)} cameras, but {len(files)} images beside it, and not of the same numbers")
+    return {}
 
 
 def _bounds(scale: np.ndarray | None) -> np.ndarray | None:
-    if scale is None or scale.shape != (4, 4):
+    if scale is None or scale.shape != (4, 4) or not np.isfinite(scale).all():
         return None
+    scale = scale.astype(np.float64)
     centre, radius = scale[:3, 3], np.abs(np.diag(scale)[:3])
-    return np.stack([centre - radius, centre + radius]).astype(np.float64)
+    return np.stack([centre - radius, centre + radius]) if radius.min() > 0 else None

@@ -1,4 +1,4 @@
-"""Kalibr ``camchain.yaml``: a chain of cameras, ``T_cn_cnm1`` from the one before; the first is the world."""
+"""Kalibr ``camchain.yaml`` (or another name): a chain of cameras, ``T_cn_cnm1`` from the one before; the first is the world."""
 
 from __future__ import annotations
 
@@ -6,37 +6,46 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ...errors import FormatError
+from ..limits import MOST_SIDE
+from .camera_folders import camera_image
+from .filestorage import read_yaml
 from .records import Found, Record
 
 MODELS = {"radtan": False, "equidistant": True, "none": False}
-"""Distortion models, and whether each is OpenCV's fisheye."""
+"""Distortion models, and whether each is OpenCV's fisheye: ``equidistant`` is, whatever its coefficients."""
+SUFFIXES = (".yaml", ".yml")
+LOOK = 4096
+"""Bytes in which a file shows whether it is a chain."""
 
 
 def find(path: Path) -> Path | None:
-    """A file whose name holds ``camchain``, or the only one in a folder."""
+    """A file whose name holds ``camchain``, or the only one in a folder; else one whose content is a chain of cameras."""
     if path.is_file():
-        return path if "camchain" in path.name and path.suffix in (".yaml", ".yml") else None
-    files = sorted([*path.glob("*camchain*.yaml"), *path.glob("*camchain*.yml")])
-    return files[0] if len(files) == 1 else None
+        return path if path.suffix in SUFFIXES and ("camchain" in path.name or _is_chain(path)) else None
+    files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES and f.is_file())
+    named = [f for f in files if "camchain" in f.name]
+    chains = named or [f for f in files if _is_chain(f)]
+    return chains[0] if len(chains) == 1 else None
+
+
+def _is_chain(path: Path) -> bool:
+    """Whether a file looks like a chain: its first camera's name starts a line, and its camera model is named."""
+    with path.open("rb") as file:
+        start = file.read(LOOK)
+    return b"camera_model:" in start and (start.startswith(b"cam0:") or b"\ncam0:" in start)
 
 
 def read(path: Path) -> Found:
-    """``cam0``, ``cam1`` ... in this order."""
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark else ""
-        raise FormatError(f"{path}{line}: {getattr(error, 'problem', None) or 'not YAML'}") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path}:1: not a text file") from None
-    chain = {k: v for k, v in data.items() if str(k).startswith("cam")} if isinstance(data, dict) else {}
+    """``cam0``, ``cam1`` ... in this order; one image of each may lie beside the file (`camera_folders.camera_image`)."""
+    documents = read_yaml(path)
+    data = documents[0] if len(documents) == 1 else None
+    chain = {k: v for k, v in data.items() if k.startswith("cam")} if isinstance(data, dict) else {}
     names = [f"cam{n}" for n in range(len(chain))]
     if not chain or set(names) != set(chain):
-        raise FormatError(f"{path}: expected cameras cam0, cam1 ..., got {', '.join(map(str, chain)) or 'none'}")
+        got = ", ".join(chain) or "none"
+        raise FormatError(f"{path}: expected cameras cam0, cam1 ..., got {got:.80}")
     records, pose = [], np.eye(4)
     for n, name in enumerate(names):
         if n:
@@ -49,19 +58,25 @@ def _array(path: Path, name: str, camera: Any, key: str, shape: tuple[int, ...])
     value = camera.get(key) if isinstance(camera, dict) else None
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
-    if array.shape != shape:
-        raise FormatError(f"{path}: {name}: {key}: expected {' x '.join(map(str, shape))} numbers, got {value!r:.80}")
+    if array.shape != shape or not np.isfinite(array).all():
+        raise FormatError(f"{path}: {name}: {key}: expected {' x '.join(map(str, shape))} finite numbers, got {value!r:.80}")
     return array
 
 
 def _record(path: Path, name: str, camera: Any, pose: np.ndarray) -> Record:
+    if not isinstance(camera, dict):
+        raise FormatError(f"{path}: {name}: expected a camera's names and values, got {camera!r:.80}")
     model, kind = camera.get("camera_model"), camera.get("distortion_model") or "none"
-    if model != "pinhole" or kind not in MODELS:
-        raise FormatError(f"{path}: {name}: expected a pinhole camera with {', '.join(MODELS)} distortion, got {model} with {kind}")
+    if model != "pinhole" or not isinstance(kind, str) or kind not in MODELS:
+        raise FormatError(
+            f"{path}: {name}: expected a pinhole camera with {', '.join(MODELS)} distortion, got {model!r:.40} with {kind!r:.40}"
+        )
     fx, fy, cx, cy = _array(path, name, camera, "intrinsics", (4,))
     width, height = _array(path, name, camera, "resolution", (2,))
+    if not (min(width, height) >= 1 and max(width, height) <= MOST_SIDE):
+        raise FormatError(f"{path}: {name}: resolution: expected 1 to {MOST_SIDE} pixels a side, got {width:g} x {height:g}")
     distortion = [] if kind == "none" else _array(path, name, camera, "distortion_coeffs", (4,)).tolist()
     return Record(
         K=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
@@ -69,7 +84,8 @@ def _record(path: Path, name: str, camera: Any, pose: np.ndarray) -> Record:
         t=pose[:3, 3],
         width=int(width),
         height=int(height),
+        image=camera_image(path.parent, name),
         name=name,
-        distortion=distortion if any(distortion) else (),
+        distortion=distortion if any(distortion) or MODELS[kind] else (),
         fisheye=MODELS[kind],
     )

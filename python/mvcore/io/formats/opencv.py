@@ -6,15 +6,18 @@ Of a camera file: ``camera_matrix`` (K), ``distortion_coefficients`` (D), ``rvec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import FormatError
+from ..limits import MOST_SIDE
+from .filestorage import read_filestorage
 from .records import Found, Record, image_in
 
 SUFFIXES = (".yml", ".yaml", ".xml")
@@ -26,6 +29,10 @@ KEYS = {
     "image": ("image", "image_name", "filename"),
     "width": ("image_width", "width"),
     "height": ("image_height", "height"),
+    "K1": ("M1", "K1"),
+    "K2": ("M2", "K2"),
+    "D1": ("D1",),
+    "D2": ("D2",),
 }
 
 
@@ -47,101 +54,122 @@ def read(path: Path) -> Found:
 
 
 def _file(path: Path) -> list[Record]:
-    with open_storage(path) as storage:
-        if not storage.getNode("M1").empty():
-            return _stereo(path, storage)
-        return [_camera(path, storage)]
+    storage = read_filestorage(path)
+    if any(storage.get(k) is not None for k in KEYS["K1"]):
+        return _stereo(path, storage)
+    return [_camera(path, storage)]
 
 
-@contextmanager
-def open_storage(path: Path) -> Iterator[cv2.FileStorage]:
-    """A storage to read from; closed at the end."""
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise FormatError(f"{path}: not an OpenCV FileStorage: {str(error).strip().splitlines()[-1]}") from None
-    try:
-        if not storage.isOpened():
-            raise FormatError(f"{path}: not an OpenCV FileStorage")
-        yield storage
-    finally:
-        storage.release()
+def storage_value(path: Path, storage: dict[str, Any], names: Sequence[str]) -> Any:
+    """The text, number or float64 matrix of the first of the names that the storage holds; None where it holds none.
 
+    A sequence of numbers is a column.
 
-def _value(path: Path, storage: cv2.FileStorage, key: str) -> Any:
-    return storage_value(path, storage, KEYS.get(key, (key,)))
-
-
-def storage_value(path: Path, storage: cv2.FileStorage, names: Sequence[str]) -> Any:
-    """The text, number or float64 matrix of the first of the names that the storage holds; None where it holds none."""
+    Raises
+    ------
+    FormatError
+        The value is something else.
+    """
     for name in names:
-        node = storage.getNode(name)
-        if node.empty():
-            continue
-        if node.isString():
-            return node.string()
-        if node.isReal() or node.isInt():
-            return node.real()
-        matrix = node.mat()
-        if matrix is None:
-            raise FormatError(f"{path}: {name}: expected a matrix")
-        return np.asarray(matrix, np.float64)
+        value = storage.get(name)
+        if isinstance(value, list) and value and all(type(v) in (int, float) for v in value):
+            value = np.array(value, np.float64).reshape(-1, 1)
+        if isinstance(value, str | int | float | np.ndarray):
+            return value
+        if value is not None:
+            raise FormatError(f"{path}: {name}: expected a matrix, a number or a text")
     return None
 
 
-def _size(path: Path, storage: cv2.FileStorage) -> tuple[int, int]:
-    width, height = _value(path, storage, "width"), _value(path, storage, "height")
-    return (int(width), int(height)) if width and height else (0, 0)
+def storage_matrix(path: Path, storage: dict[str, Any], names: Sequence[str], sizes: Sequence[int]) -> Any:
+    """A float64 matrix of one of the ``sizes`` (numbers in it) under the first of the names, None where there is none.
+
+    Raises
+    ------
+    FormatError
+        Another kind of value, another size, or NaN or infinity.
+    """
+    value = storage_value(path, storage, names)
+    if value is None:
+        return None
+    count = value.size if isinstance(value, np.ndarray) else 0
+    if count not in sizes or not np.isfinite(value).all():
+        got = f"{count} of them" if count else repr(value)[:80]
+        raise FormatError(f"{path}: {names[0]}: expected {' or '.join(map(str, sizes))} finite numbers, got {got}")
+    return value
 
 
-def _camera(path: Path, storage: cv2.FileStorage) -> Record:
-    matrix, rotation, t = (_value(path, storage, k) for k in ("K", "R", "t"))
+def storage_size(path: Path, storage: dict[str, Any], width: Sequence[str], height: Sequence[str]) -> tuple[int, int]:
+    """Width and height in pixels, (0, 0) where either is missing or 0.
+
+    Raises
+    ------
+    FormatError
+        No whole numbers from 0 to `mvcore.io.limits.MOST_SIDE`.
+    """
+    sizes = []
+    for names in (width, height):
+        value = storage_value(path, storage, names)
+        number = value if isinstance(value, int | float) else 0 if value is None else math.nan
+        if not 0 <= number <= MOST_SIDE or number != int(number):
+            raise FormatError(f"{path}: {names[0]}: expected a number of pixels, got {value!r:.80}")
+        sizes.append(int(number))
+    return (sizes[0], sizes[1]) if all(sizes) else (0, 0)
+
+
+def rotation_of(value: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation matrix from itself or from a Rodrigues vector of finite numbers."""
+    return cv2.Rodrigues(value.reshape(3, 1))[0] if value.size == 3 else value.reshape(3, 3)
+
+
+def _camera(path: Path, storage: dict[str, Any]) -> Record:
+    sizes = {"K": (9,), "R": (3, 9), "t": (3,)}
+    matrix, rotation, t = (storage_matrix(path, storage, KEYS[k], n) for k, n in sizes.items())
     if matrix is None or rotation is None or t is None:
         missing = [k for k, v in (("camera_matrix", matrix), ("R or rvec", rotation), ("tvec", t)) if v is None]
         raise FormatError(f"{path}: {', '.join(missing)} missing")
-    if rotation.size == 3:
-        rotation, _ = cv2.Rodrigues(rotation.reshape(3, 1))
-    distortion = _value(path, storage, "D")
-    width, height = _size(path, storage)
-    name = _value(path, storage, "image") or path.stem
+    width, height = storage_size(path, storage, KEYS["width"], KEYS["height"])
+    name = str(storage_value(path, storage, KEYS["image"]) or path.stem)
     return Record(
-        K=matrix,
-        R=rotation,
+        K=matrix.reshape(3, 3),
+        R=rotation_of(rotation),
         t=t.reshape(-1),
         width=width,
         height=height,
         image=image_in(path.parent, name),
         name=name,
-        distortion=_nonzero(distortion),
+        distortion=storage_distortion(path, storage, KEYS["D"]),
     )
 
 
-def _nonzero(distortion: Any) -> list[float]:
-    values = [] if distortion is None else np.asarray(distortion, float).reshape(-1).tolist()
-    return values if any(values) else []
+def storage_distortion(path: Path, storage: dict[str, Any], names: Sequence[str]) -> list[float]:
+    """Distortion coefficients, none where all are zero."""
+    distortion = storage_matrix(path, storage, names, (0, 1, 2, 4, 5, 8, 12, 14))
+    values = [] if distortion is None else distortion.reshape(-1).tolist()
+    return [*values, *[0.0] * (4 - len(values))] if any(values) else []
 
 
-def _stereo(path: Path, storage: cv2.FileStorage) -> list[Record]:
-    r, t = _value(path, storage, "R"), _value(path, storage, "t")
+def _stereo(path: Path, storage: dict[str, Any]) -> list[Record]:
+    r, t = (storage_matrix(path, storage, KEYS[k], n) for k, n in (("R", (3, 9)), ("t", (3,))))
     if r is None or t is None:
         raise FormatError(f"{path}: R and T of the second camera missing")
-    width, height = _size(path, storage)
+    width, height = storage_size(path, storage, KEYS["width"], KEYS["height"])
     records = []
-    for n, (rotation, shift) in enumerate(((np.eye(3), np.zeros(3)), (r, t.reshape(-1))), 1):
-        matrix = _value(path, storage, f"M{n}")
+    for n, (rotation, shift) in enumerate(((np.eye(3), np.zeros(3)), (rotation_of(r), t.reshape(-1))), 1):
+        matrix = storage_matrix(path, storage, KEYS[f"K{n}"], (9,))
         if matrix is None:
             raise FormatError(f"{path}: M{n} missing")
         image = next((i for s in (("left", "im0", "view1"), ("right", "im1", "view5"))[n - 1] if (i := image_in(path.parent, s))), None)
         records.append(
             Record(
-                K=matrix,
+                K=matrix.reshape(3, 3),
                 R=rotation,
                 t=shift,
                 width=width,
                 height=height,
                 image=image,
                 name=image.name if image else ("left", "right")[n - 1],
-                distortion=_nonzero(_value(path, storage, f"D{n}")),
+                distortion=storage_distortion(path, storage, KEYS[f"D{n}"]),
             )
         )
     return records

@@ -6,15 +6,21 @@ them.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from ...errors import FormatError
+from ..limits import MOST_SIDE
+from .camera_folders import camera_image
+from .filestorage import read_xml
 from .records import Found, Record
 
 SUBPIXELS = 64.0
+MOST = 1e12
+"""A number in the file, in whatever unit."""
 
 
 def find(path: Path) -> Path | None:
@@ -27,10 +33,7 @@ def find(path: Path) -> Path | None:
 
 def read(path: Path) -> Found:
     """The cameras in the order of the file."""
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise FormatError(f"{path}:{error.position[0]}: {error.msg if hasattr(error, 'msg') else error}") from None
+    root = read_xml(path)
     cameras = [c for c in root.iter("camera") if c.find("intrinsic") is not None]
     return Found([_record(path, n, c) for n, c in enumerate(cameras)], path)
 
@@ -44,12 +47,17 @@ def _record(path: Path, number: int, camera: ElementTree.Element) -> Record:
         if text is None and default is not None:
             return default
         try:
-            return float(text)  # type: ignore[arg-type]
+            number = float(text)  # type: ignore[arg-type]
         except (TypeError, ValueError):
-            raise FormatError(f"{path}: camera {name}: {part} {key}: expected a number, got {text!r}") from None
+            number = math.nan
+        if not abs(number) <= MOST:
+            raise FormatError(f"{path}: camera {name:.80}: {part} {key}: expected a number, got {text!r:.80}")
+        return number
 
     left, top = value("fov_video", "left"), value("fov_video", "top")
     width, height = value("fov_video", "right") - left + 1, value("fov_video", "bottom") - top + 1
+    if not (1 <= round(width) <= MOST_SIDE and 1 <= round(height) <= MOST_SIDE):
+        raise FormatError(f"{path}: camera {name:.80}: fov_video: expected 1 to {MOST_SIDE} pixels a side, got {width:g} x {height:g}")
     focal = [value("intrinsic", f"focalLength{a}") / SUBPIXELS for a in "UV"]
     center = [value("intrinsic", f"centerPoint{a}") / SUBPIXELS - o for a, o in (("U", left), ("V", top))]
     skew = value("intrinsic", "skew", 0.0) / SUBPIXELS
@@ -67,6 +75,7 @@ def _record(path: Path, number: int, camera: ElementTree.Element) -> Record:
         t=-rotation @ position,
         width=round(width),
         height=round(height),
+        image=camera_image(path.parent, name),
         name=name,
         distortion=(distortion if distortion[4] else distortion[:4]) if any(distortion) else (),
     )

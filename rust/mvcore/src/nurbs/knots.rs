@@ -37,9 +37,9 @@ impl Knots {
     /// repeated more than `degree + 1` times. `argument` names them in errors.
     pub fn new(argument: &'static str, values: &[f64], count: usize) -> Result<Self> {
         require(
-            values.len() >= count + 2 && count >= 2,
+            values.len() >= count.saturating_add(2) && count >= 2,
             argument,
-            format!("at least {} values for {count} control points", count + 2),
+            format!("at least {} values for {count} control points", count.saturating_add(2)),
             values.len(),
         )?;
         let degree = values.len() - count - 1;

@@ -1,0 +1,114 @@
+"""Calibrations that name cameras and no images, as rigs write them: what lies where, and what is refused."""
+
+import cv2
+import mvcore
+import numpy as np
+import pytest
+from conftest import rig
+from fuzz import seeds
+from mvcore.errors import FormatError
+from mvcore.io.formats.camera_folders import camera_image, plain_name
+from mvcore.io.scene import Scene
+
+
+@pytest.fixture
+def scene():
+    return Scene(frames=(), calib=mvcore.Calibration(tuple(rig(3, (32, 24)))))
+
+
+def picture(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.zeros((24, 32, 3), np.uint8))
+    return path
+
+
+def test_where_a_cameras_image_lies(tmp_path):
+    for n, place in enumerate(("a.png", "images/a.png", "images/a/0.jpg", "a/0.jpg", "a/data/0.jpg")):
+        image = picture(tmp_path / str(n) / place)
+        assert camera_image(tmp_path / str(n), "a") == image
+    picture(tmp_path / "3" / "a" / "1.jpg")  # a clip
+    assert camera_image(tmp_path / "3", "a") is None
+    for name in ("", "..", "../a", "/etc/passwd", "a\0", "a\\b"):
+        assert not plain_name(name)
+        assert camera_image(tmp_path, name) is None
+
+
+def test_easymocap_with_one_image_a_camera_and_names_without_quotes(tmp_path, scene):
+    for n in range(3):
+        picture(tmp_path / f"{n}.png")
+    seeds._easymocap(tmp_path, scene)
+    for n in range(3):
+        picture(tmp_path / "images" / f"0{n}" / "000000.jpg")
+    for file in ("intri.yml", "extri.yml"):
+        text = (tmp_path / file).read_text()
+        for n in range(3):
+            text = text.replace(f'"{n}"', f"0{n}").replace(f"_{n}:", f"_0{n}:")
+        (tmp_path / file).write_text(text.replace("%YAML 1.2", "%YAML:1.0"))
+    read = mvcore.load(tmp_path)
+    assert [c.name for c in read.calib] == ["00", "01", "02"]
+    assert [f.relative_to(tmp_path).as_posix() for f in read.frames] == [f"images/0{n}/000000.jpg" for n in range(3)]
+    for a, b in zip(read.calib, scene.calib):
+        np.testing.assert_allclose(a.project([[0.1, 0.2, 0.3]]), b.project([[0.1, 0.2, 0.3]]), atol=1e-9)
+    text = (tmp_path / "intri.yml").read_text()
+    (tmp_path / "intri.yml").write_text(text.replace("- 00", "- ../00"))
+    with pytest.raises(FormatError, match=r"intri\.yml: expected a list 'names' of cameras"):
+        mvcore.load(tmp_path)
+    (tmp_path / "intri.yml").write_text(text.replace("W_01: 32", "W_01: 1e300"))
+    with pytest.raises(FormatError, match=r"intri\.yml: W_01: expected a number of pixels"):
+        mvcore.load(tmp_path)
+
+
+def test_kalibr_by_its_content_and_a_fisheye_without_distortion(tmp_path, scene):
+    for n in range(3):
+        picture(tmp_path / f"{n}.png")
+    seeds._kalibr(tmp_path, scene)
+    for n in range(3):
+        (tmp_path / f"cam{n}.png").unlink()
+        picture(tmp_path / f"cam{n}" / "data" / "0001.jpg")
+    text = (tmp_path / "camchain.yaml").read_text()
+    (tmp_path / "camchain.yaml").unlink()
+    (tmp_path / "result.yaml").write_text(text.replace("[0.1, 0.0", "[0.0, 0.0"))
+    (tmp_path / "other.yaml").write_text("a: 1\n")
+    for path in (tmp_path, tmp_path / "result.yaml"):
+        read = mvcore.load(path)
+        assert [f.relative_to(tmp_path).as_posix() for f in read.frames] == [f"cam{n}/data/0001.jpg" for n in range(3)]
+        assert all(c.fisheye and c.distortion.tolist() == [0, 0, 0, 0] for c in read.calib)
+    for old, new, message in (
+        ("resolution: [32", "resolution: [1e9", "resolution: expected 1 to"),
+        ("intrinsics: [", "intrinsics: [.nan, ", "intrinsics: expected 4 finite numbers"),
+        ("cam1:", "cam7:", "expected cameras cam0, cam1"),
+    ):
+        (tmp_path / "result.yaml").write_text(text.replace(old, new))
+        with pytest.raises(FormatError, match=rf"result\.yaml: .*{message}"):
+            mvcore.load(tmp_path / "result.yaml")
+
+
+def test_qualisys_images_and_numbers(tmp_path, scene):
+    for n in range(3):
+        picture(tmp_path / f"{n}.png")
+    seeds._qualisys(tmp_path, scene)
+    assert [f.name for f in mvcore.load(tmp_path).frames] == ["0.png", "1.png", "2.png"]
+    path = tmp_path / "a.qca.txt"
+    text = path.read_text()
+    for old, new in (('right="31"', 'right="1e300"'), ('right="31"', 'right="nan"'), ('right="31"', 'right="-5"')):
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(FormatError, match=r"a\.qca\.txt: camera 0: fov_video"):
+            mvcore.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "images"), [((0, 1, 3), ("000", "001", "003")), ((1, 2, 3), ("000", "001", "002")), ((0, 1, 2), ("a", "b", "c"))]
+)
+def test_idr_keys_and_images(tmp_path, scene, keys, images):
+    for name in images:
+        picture(tmp_path / "image" / f"{name}.png")
+    (tmp_path / "image" / f"._{images[0]}.png").write_bytes(b"left by a file manager")
+    np.savez(tmp_path / "cameras_sphere.npz", **{f"world_mat_{k}": c.projection for k, c in zip(keys, scene.calib)})
+    read = mvcore.load(tmp_path)
+    assert [f.stem for f in read.frames] == list(images)
+    for a, b in zip(read.calib, scene.calib):
+        np.testing.assert_allclose(a.center, b.center, atol=1e-9)
+    picture(tmp_path / "image" / "extra.png")
+    if keys != (0, 1, 3):
+        with pytest.raises(FormatError, match="3 cameras, but 4 images"):
+            mvcore.load(tmp_path)
