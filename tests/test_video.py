@@ -24,6 +24,7 @@ from mvcore.cli.main import app
 from mvcore.config import TargetConfig, VolumeConfig
 from mvcore.geometry.registration import Cloud, find_poses
 from mvcore.io import load_video
+from mvcore.io.meshes import animated
 from mvcore.mesh.hull_parts import find_targets, motions, moved, on_targets
 from mvcore.mesh.surface import isosurface
 from mvcore.pipeline.store import Store, digest
@@ -31,7 +32,7 @@ from mvcore.silhouettes.background_subtraction import Background, foreground, le
 from mvcore.silhouettes.visual_hull import Occupancy, carve_silhouettes, shadow
 from mvcore.video.api import reconstruct_video
 from mvcore.video.tracking import Tracker
-from mvcore.video.writer import animated, read_index
+from mvcore.video.writer import read_index
 from mvcore.viewer.page import write_page
 from mvcore.volume.photo_hull import visual_hull
 from typer.testing import CliRunner

@@ -106,7 +106,7 @@ def reconstruct(
         from ..io import load
         from ..io.images import find_masks
         from ..pipeline import reconstruct as pipeline
-        from ..pipeline.result import FORMATS
+        from ..io.meshes import FORMATS
 
         if output.suffix.lower() not in FORMATS:
             raise ValueError(f"--output: expected a name ending in {', '.join(FORMATS)}, got {str(output)!r}")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,14 +15,13 @@ from PIL import Image as PillowImage
 from .. import _core
 from ..errors import InvalidInputError, require
 from ..geometry.cameras import Calibration
-from ..io.files import atomically, staged
+from ..io.files import atomically
 from ..io.maps import colourise, write_depth_png, write_pfm
+from ..io.meshes import TexturedMesh, save_mesh
 from ..types import Bounds, DepthMap, Image, SparsePoints
 
 if TYPE_CHECKING:
     import trimesh
-
-FORMATS = (".glb", ".obj", ".ply")
 
 
 @dataclass
@@ -64,67 +61,33 @@ class Reconstruction:
         """What went less well than it should."""
         return list(self.report.get("warnings", []))
 
+    @property
+    def textured(self) -> TexturedMesh:
+        """The mesh as `mvcore.io.meshes` writes it."""
+        voxel = self.report.get("volume", {}).get("voxel")
+        if voxel is None:  # a mesh of another source: its edges tell how fine it is
+            edges = self.vertices[self.faces] - self.vertices[np.roll(self.faces, 1, 1)] if len(self.faces) else np.ones((1, 3))
+            voxel = float(np.median(np.linalg.norm(edges, axis=-1)))
+        return TexturedMesh(self.vertices, self.faces, self.uv, self.texture, float(voxel))
+
     def save(self, path: str | Path) -> None:
         """Write ``.glb`` (texture inside), ``.obj`` (+ .mtl, .png) or ``.ply`` (vertex colours); complete or not at all.
+
+        Coordinates are the caller's, to a hundredth of a voxel and better. Where GLB's float32 cannot hold them, its vertices are relative
+        to the translation of their node, which the file's ``extras`` and ``report["glb_offset"]`` repeat.
 
         Raises
         ------
         InvalidInputError
             Another suffix.
         """
-        path = Path(path)
-        require(path.suffix.lower() in FORMATS, "path", f"a name ending in {', '.join(FORMATS)}", repr(str(path)))
-        if path.suffix.lower() == ".obj":
-            self._save_obj(path)
-        else:
-            data = self._glb() if path.suffix.lower() == ".glb" else self._ply()
-            atomically(path, lambda p: p.write_bytes(data) and None)
-
-    def _glb(self) -> bytes:
-        from trimesh.exchange.gltf import export_glb
-
-        def unlit(tree: dict[str, Any]) -> None:
-            tree.setdefault("extensionsUsed", []).append("KHR_materials_unlit")
-            for material in tree.get("materials", []):
-                material.setdefault("extensions", {})["KHR_materials_unlit"] = {}
-
-        mesh = self.mesh
-        encoded = _core.encode_png(np.ascontiguousarray(self.texture))
-        # trimesh has Pillow encode the image, which takes longer than all the rest of the export for a tenth less bytes.
-        mesh.visual.material.baseColorTexture.save = lambda file, format: file.write(encoded)
-        return export_glb(mesh.scene(), tree_postprocessor=unlit)
+        offset = save_mesh(path, self.textured)
+        if offset is not None:
+            self.report["glb_offset"] = offset.tolist()
 
     def vertex_colours(self) -> NDArray[np.uint8]:
         """Texture colour of each vertex, (V, 3) uint8."""
-        h, w = self.texture.shape[:2]
-        x = np.clip(np.rint(self.uv[:, 0] * w - 0.5).astype(int), 0, w - 1)
-        y = np.clip(np.rint((1 - self.uv[:, 1]) * h - 0.5).astype(int), 0, h - 1)
-        return self.texture[y, x]
-
-    def _ply(self) -> bytes:
-        import trimesh
-
-        mesh = trimesh.Trimesh(self.vertices, self.faces, vertex_colors=self.vertex_colours(), process=False)
-        return mesh.export(file_type="ply")
-
-    def _save_obj(self, path: Path) -> None:
-        stem = path.stem
-        text = io.StringIO()
-        text.write(f"mtllib {stem}.mtl\nusemtl photo\n")
-        np.savetxt(text, self.vertices, "v %.9g %.9g %.9g")
-        np.savetxt(text, self.uv, "vt %.7g %.7g")
-        number = self.faces.astype(np.int64) + 1
-        np.savetxt(text, np.repeat(number, 2, axis=1), "f %d/%d %d/%d %d/%d")
-        parts = {
-            f"{stem}.png": _core.encode_png(np.ascontiguousarray(self.texture)),
-            f"{stem}.mtl": f"newmtl photo\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {stem}.png\n".encode(),
-            f"{stem}.obj": text.getvalue().encode(),
-        }
-        with staged(path) as folder:
-            for name, data in parts.items():
-                (folder / name).write_bytes(data)
-            for name in parts:  # the OBJ last: once it is there, all it names is there
-                os.replace(folder / name, path.parent / name)
+        return self.textured.vertex_colours()
 
     def save_depth(self, folder: str | Path, format: str = "pfm") -> None:
         """Write each view's filtered depth as ``pfm``, ``png`` (16 bit, scale beside it) or ``npz``, and a coloured picture."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from ..errors import FormatError
 from ..io.files import atomically
 from ..io.limits import read_json
 from ..io.maps import colourise
+from ..io.meshes import animated
 from ..pipeline.result import Reconstruction
 
 INDEX = "index.json"
@@ -97,54 +97,3 @@ def _save_picture(path: Path, depth: NDArray[np.float32]) -> None:
     if not done:
         raise OSError(f"{path}: the picture cannot be encoded")
     atomically(path, lambda p: p.write_bytes(data.tobytes()) and None)
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(x, y, z, w) of a rotation matrix."""
-    vector = cv2.Rodrigues(np.ascontiguousarray(rotation))[0].ravel()
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle > 0 else np.zeros(3)
-    return np.append(axis * np.sin(angle / 2), np.cos(angle / 2))
-
-
-def animated(glb: bytes, times: NDArray[np.float64], poses: NDArray[np.float64]) -> bytes:
-    """A GLB whose scene moves along ``poses`` (T, 4, 4) at ``times`` (T,) seconds, as a glTF 2.0 animation.
-
-    Raises
-    ------
-    FormatError
-        Not a binary glTF file.
-    """
-    magic, version, _ = struct.unpack_from("<4sII", glb)
-    if magic != b"glTF" or version != 2:
-        raise FormatError("glb: expected a binary glTF 2.0 file")
-    size, _ = struct.unpack_from("<I4s", glb, 12)
-    tree = json.loads(glb[20 : 20 + size])
-    body = glb[20 + size + 8 :]
-    body += b"\0" * (-len(body) % 4)
-    turns = np.stack([_quaternion(p[:3, :3]) for p in poses])
-    for k in range(1, len(turns)):  # the short way round
-        if turns[k] @ turns[k - 1] < 0:
-            turns[k] = -turns[k]
-    accessors = []
-    for values, kind in ((times - times[0], "SCALAR"), (poses[:, :3, 3], "VEC3"), (turns, "VEC4")):
-        data = np.ascontiguousarray(values, "<f4")
-        tree.setdefault("bufferViews", []).append({"buffer": 0, "byteOffset": len(body), "byteLength": data.nbytes})
-        accessor = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": 5126, "count": len(data), "type": kind}
-        if kind == "SCALAR":  # the standard asks for the range of times
-            accessor |= {"min": [float(data.min())], "max": [float(data.max())]}
-        tree.setdefault("accessors", []).append(accessor)
-        accessors.append(len(tree["accessors"]) - 1)
-        body += data.tobytes()
-    scene = tree["scenes"][tree.get("scene", 0)]
-    tree["nodes"].append({"name": "target", "children": scene["nodes"]})
-    node = len(tree["nodes"]) - 1
-    scene["nodes"] = [node]
-    samplers = [{"input": accessors[0], "output": a, "interpolation": "LINEAR"} for a in accessors[1:]]
-    channels = [{"sampler": n, "target": {"node": node, "path": path}} for n, path in enumerate(("translation", "rotation"))]
-    tree["animations"] = [{"name": "trajectory", "samplers": samplers, "channels": channels}]
-    tree["buffers"][0]["byteLength"] = len(body)
-    text = json.dumps(tree, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body))
-    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
