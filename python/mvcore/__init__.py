@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .evaluation import metrics
     from .io import load, load_video, save_calibration
     from .io.scene import Scene
+    from .pipeline.preflight import check
     from .pipeline.reconstruct import reconstruct
     from .pipeline.result import Reconstruction
     from .video.api import reconstruct_video
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 __version__ = _version("mvcore")
 
 _LATER = {
+    "check": "pipeline.preflight",
     "disparity": "depth",
     "load": "io",
     "load_video": "io",
@@ -51,6 +53,7 @@ __all__ = [
     "Scene",
     "SparsePoints",
     "carve",
+    "check",
     "disparity",
     "load",
     "load_video",

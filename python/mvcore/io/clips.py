@@ -20,6 +20,7 @@ from .formats.records import image_size
 from .images import undistort
 from .media import Clip, frame_files, is_video, plate_in
 from .pairing import natural_order
+from .selection import select_views
 from .streams import open_stream
 from .timeline import timeline
 
@@ -117,6 +118,9 @@ def load_video(
     start: int = 0,
     stop: int | None = None,
     stride: int = 1,
+    only: str | None = None,
+    exclude: str | None = None,
+    allow_outside: bool = False,
 ) -> Clips:
     """Open synchronised clips; no frame is kept.
 
@@ -130,6 +134,8 @@ def load_video(
     rotation : degrees clockwise (0, 90, 180, 270) by which stored frames are turned, of all cameras or by name; ``auto`` turns them as the
         file says where the calibration's size allows it.
     start, stop, stride : instants to take, as in ``range``; instants are the frames of the slowest camera.
+    only, exclude : cameras by name, pattern or number, as on the command line: ``"cam*,0-3"``.
+    allow_outside : follow paths in the calibration that lead out of its folder.
 
     Raises
     ------
@@ -145,15 +151,19 @@ def load_video(
     >>> len(load_video({"a": frames, "b": frames}, [camera, camera]))
     3
     """
-    sources = dict(path) if isinstance(path, Mapping) else _find_sources(Path(path))
+    sources = dict(path) if isinstance(path, Mapping) else find_sources(Path(path))
     clips = [_clip(name, source) for name, source in sources.items()]
     if calib is None:
         require(not isinstance(path, Mapping), "calib", "cameras for the given clips", None)
-        calib = load(path, images=False).calib  # type: ignore[arg-type]
+        calib = load(path, images=False, allow_outside=allow_outside).calib  # type: ignore[arg-type]
     elif isinstance(calib, str | Path):
-        calib = load(calib, images=False).calib
+        calib = load(calib, images=False, allow_outside=allow_outside).calib
     cameras = list(calib)
     warnings: list[str] = []
+    if only is not None or exclude is not None:
+        named = any(c.name for c in cameras)
+        kept = select_views([c.name for c in (cameras if named else clips)], only, exclude)
+        clips, cameras = clips if named else [clips[n] for n in kept], [cameras[n] for n in kept]
     clips = turned(matched(clips, cameras), cameras, rotation, warnings)
     warnings += [f"{c.name}: frames are interlaced: moving edges have teeth" for c in clips if _interlaced(c)]
     cameras = [fitted(clip, camera, warnings) for clip, camera in zip(clips, cameras, strict=True)]
@@ -170,7 +180,7 @@ def _interlaced(clip: Clip) -> bool:
     return isinstance(clip.source, Path) and open_stream(clip.source).interlaced
 
 
-def _find_sources(folder: Path) -> dict[str, Source]:
+def find_sources(folder: Path) -> dict[str, Source]:
     """The cameras' clips below a folder, by name."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of clips")
@@ -183,7 +193,10 @@ def _find_sources(folder: Path) -> dict[str, Source]:
         folders = [f for f in base.iterdir() if f.is_dir() and f.name not in ("masks", "depth", "videos", "images") and frame_files(f)]
         if folders:
             return {f.name: f for f in sorted(folders, key=natural_order)}
-    raise FormatError(f"{folder}: expected video files or a folder of images a camera, in it or in its 'videos' or 'images'")
+    raise FormatError(
+        f"{folder}: expected video files or a folder of images a camera, in it or in its 'videos' or 'images'; for images of one moment "
+        "use 'mvcore reconstruct'"
+    )
 
 
 def _by_stem(videos: Sequence[Path]) -> dict[str, Source]:
