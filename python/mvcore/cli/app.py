@@ -82,7 +82,6 @@ class Commands(TyperGroup):
         try:
             code = super().main(words, *rest, standalone_mode=False, **extra)
         except (KeyboardInterrupt, typer.Abort):
-            print("interrupted", file=sys.stderr)
             code = INTERRUPTED
         except UsageProblem as error:
             code = _usage(error)
@@ -90,6 +89,8 @@ class Commands(TyperGroup):
             if "--debug" in words:
                 raise
             code = _failed(error)
+        if code == INTERRUPTED:  # typer makes this code of Ctrl-C, click an exception
+            print("interrupted", file=sys.stderr)
         if standalone_mode:
             sys.exit(code if isinstance(code, int) else DONE)
         return code

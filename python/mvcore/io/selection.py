@@ -17,8 +17,8 @@ def select_views(names: Sequence[str], only: str | None = None, exclude: str | N
     Parameters
     ----------
     names : of the views: a camera's, or its image's path.
-    only, exclude : separated by commas, names (with or without folders and suffix), patterns with ``*``, ``?`` and ``[]``, numbers from 0
-        and ranges of them (``0-3``, both ends). A name counts before a number.
+    only, exclude : separated by commas, names (with or without suffix, or a folder's), patterns with ``*``, ``?`` and ``[]``, numbers
+        from 0 and ranges of them (``0-3``, both ends). A name counts before a number.
 
     Raises
     ------
@@ -57,4 +57,4 @@ def _chosen(names: Sequence[str], text: str, argument: str) -> set[int]:
 
 def _fits(name: str, word: str) -> bool:
     path = PurePath(name)
-    return bool(name) and any(fnmatchcase(form, word) for form in (name, path.name, path.stem))
+    return bool(name) and any(fnmatchcase(form, word) for form in (name, path.stem, *path.parts))

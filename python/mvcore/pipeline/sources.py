@@ -74,8 +74,8 @@ class ClipFrame:
         if isinstance(source, np.ndarray):
             return digest(source)
         if isinstance(source, Path):
-            return content_of(source, self.number)
-        return content_of(source[self.number])
+            return [self.clip.turn, content_of(source, self.number)]
+        return [self.clip.turn, content_of(source[self.number])]
 
     def image(self) -> Image:
         """(h, w, 3) uint8 RGB, as it decodes."""

@@ -1,0 +1,191 @@
+"""What is said before any work."""
+
+import os
+from dataclasses import replace
+
+import cv2
+import mvcore
+import numpy as np
+import pytest
+from conftest import look_at, rig, write_clips, write_scene
+from mvcore import Config, InvalidInputError
+from mvcore.io import load_video
+from mvcore.pipeline import checks
+from mvcore.pipeline.checks import check_writable
+from mvcore.pipeline.preflight import candidate_sources, preflight, preflight_clips
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Twelve grey images around the origin, with masks of a disc."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_scene(folder, rig(12), [np.full((120, 160, 3), 90, np.uint8)] * 12)
+    (folder / "masks").mkdir()
+    for n in range(12):
+        mask = cv2.circle(np.zeros((120, 160), np.uint8), (80, 60), 40, 255, -1)
+        cv2.imwrite(str(folder / "masks" / f"{n:03d}.png"), mask)
+    return folder
+
+
+def test_a_good_scene_has_an_outlook(scene):
+    done = mvcore.check(scene, masks=scene / "masks")
+    assert done.errors == []
+    assert not [w for w in done.warnings if not w.startswith("installation")]
+    plan = done.outlook
+    assert (plan.views, plan.frames, plan.width, plan.height) == (12, 1, 160, 120)
+    assert all(1 <= len(s) <= 6 for s in plan.sources)
+    assert plan.minutes > 0
+    assert plan.memory > 1 << 20
+    assert done.as_dict()["good"]
+    done.require_good()
+
+
+def test_time_grows_with_views_pixels_and_moments(scene):
+    cameras = rig(12)
+    one = preflight(None, cameras).outlook
+    assert preflight(None, cameras, moments=10).outlook.minutes == pytest.approx(10 * one.minutes, rel=0.1)
+    small = preflight(None, cameras, config={"depth": {"max_image_size": 40}}).outlook
+    assert (small.width, small.height) == (40, 30)
+    assert small.minutes < one.minutes
+    assert small.memory < one.memory
+    assert preflight(None, rig(6)).outlook.minutes < one.minutes
+
+
+def test_sources_by_poses_alone():
+    """On a circle of 24 cameras neighbours come first, and none beyond 65 degrees."""
+    cameras = [look_at((3 * np.cos(a), 3 * np.sin(a), 0), (0, 0, 0)) for a in np.radians(np.arange(0, 360, 15))]
+    for n, sources in enumerate(candidate_sources(cameras, Config())):
+        assert {(n - 1) % 24, (n + 1) % 24} == set(sources[:2])
+        assert all(min((n - s) % 24, (s - n) % 24) <= 4 for s in sources)
+    back_to_back = [look_at((0, 0, 0), (1, 0, 0)), look_at((0.1, 0, 0), (-1, 0, 0))]
+    assert any("no two views" in w for w in preflight(None, back_to_back).warnings)
+
+
+def test_cameras_in_doubt():
+    cameras = rig(4)
+    strange = [
+        replace(cameras[0], K=np.array([[1.2, 0, 80], [0, 1.2, 60], [0, 0, 1.0]])),
+        replace(cameras[1], K=np.array([[200, 0, 80], [0, 120, 60], [0, 0, 1.0]])),
+        replace(cameras[2], K=np.array([[200, 0, 800], [0, 200, 60], [0, 0, 1.0]])),
+        replace(cameras[0], name="twin"),
+        *cameras[3:],
+    ]
+    said = " ".join(preflight(None, strange).warnings)
+    for part in ("view 0: a focal length of 0.0075 times", "differ by more than a quarter", "outside its 160 x 120", "2 cameras stand"):
+        assert part in said
+    assert "coincident" in preflight(None, [cameras[0]] * 3).errors[0]
+    assert "at least 2 cameras" in preflight(None, cameras[:1]).errors[0]
+
+
+def test_images_are_opened_for_their_headers_alone(scene, tmp_path):
+    found = mvcore.load(scene)
+    files = list(found.frames)
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(files[0].read_bytes()[:60])  # the header, and no pixels
+    assert preflight([cut, *files[1:]], found.calib).errors == []
+    (tmp_path / "none.png").write_bytes(b"none")
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((20, 30, 3), np.uint8))
+    done = preflight([tmp_path / "none.png", tmp_path / "small.png", tmp_path / "gone.png", *files[3:]], found.calib)
+    assert [e.split(" ")[1] for e in done.errors] == ["0", "1", "2"]
+    assert "160 x 120" in done.errors[1]
+    assert "30 x 20" in done.errors[1]
+    assert "expected 12, one a camera, got 3" in preflight(files[:3], found.calib).errors[0]
+    arrays = preflight([np.zeros((120, 160, 3), np.float32)] * 12, found.calib)
+    assert "uint8" in arrays.errors[0]
+    with pytest.raises(InvalidInputError, match=r"uint8.*and 11 more"):
+        arrays.require_good()
+
+
+def test_masks_that_are_empty_inverted_or_of_another_size(scene):
+    found, disc = mvcore.load(scene), np.zeros((120, 160), np.uint8)
+    disc[20:100, 30:130] = 255
+
+    def look(masks):
+        return preflight(found.frames, found.calib, masks)
+
+    assert not [w for w in look([disc] * 12).warnings if w.startswith("masks")]
+    assert any("inverted" in w for w in look([255 - disc] * 12).warnings)
+    assert any("1 of 12 masks are empty (3)" in w for w in look([disc] * 3 + [0 * disc] + [disc] * 8).warnings)
+    assert any("all are empty" in e for e in look([0 * disc] * 12).errors)
+    assert any("no mask" in w for w in look([disc] * 11 + [None]).warnings)
+    assert look([np.kron(disc, np.ones((2, 2), np.uint8))] * 12).errors == []
+    assert len(look([disc[:50]] * 12).errors) == 12
+    assert "expected 12" in look([disc] * 3).errors[0]
+    assert "no such folder" in look("nowhere").errors[0]
+
+
+def test_bounds_must_be_a_box_that_is_seen():
+    cameras = rig(4)
+    assert preflight(None, cameras, bounds=[-1, -1, -1, 1, 1, 1]).errors == []
+    for box, part in (
+        ([1, 2], "2 values"),
+        ([1, 1, 1, 0, 0, 0], "x0 < x1"),
+        ([0, 0, 0, 1, 1, float("nan")], "x0 < x1"),
+        ("abc", "could not convert"),
+        ([1000, 1000, 1000, 1001, 1001, 1001], "no camera sees"),
+    ):
+        assert part in preflight(None, cameras, bounds=box).errors[0]
+
+
+def test_places_are_tried_and_left_as_they_were(tmp_path):
+    check_writable(tmp_path / "a.glb")
+    check_writable(tmp_path / "new" / "deep" / "a.glb")
+    check_writable(tmp_path / "new", folder=True)
+    assert not list(tmp_path.iterdir())
+    old = tmp_path / "old.glb"
+    old.write_text("old")
+    check_writable(old)
+    assert old.read_text() == "old"
+    for place, folder, part in (
+        (tmp_path, False, "got a folder"),
+        (old, True, "got a file"),
+        (old / "in.glb", False, "which is no folder"),
+        ("/proc/none/a.glb", False, "in /proc"),
+    ):
+        with pytest.raises(InvalidInputError, match=part):
+            check_writable(place, folder=folder)
+    if os.geteuid():
+        (tmp_path / "ro").mkdir(mode=0o555)
+        with pytest.raises(InvalidInputError, match="Permission denied"):
+            check_writable(tmp_path / "ro" / "a.glb")
+    done = preflight(None, rig(4), outputs=["/proc/none/a.glb"], folders=[old], workdir=old)
+    assert len(done.errors) == 2
+
+
+def test_a_missing_device_is_named_without_importing_torch(monkeypatch):
+    monkeypatch.setattr("mvcore.network.devices.cuda_available", lambda: False)
+    assert "CUDA" in preflight(None, rig(4), config={"device": "cuda"}).errors[0]
+    monkeypatch.setattr(checks.importlib.util, "find_spec", lambda name: None)
+    assert "torch" in preflight(None, rig(4), config={"matcher": "dcnn"}).errors[0]
+    assert preflight(None, rig(4)).errors == []
+
+
+def test_settings_memory_and_two_opencvs(monkeypatch):
+    assert "coarsest" in preflight(None, rig(4), config={"depth": {"coarsest": 0}}).errors[0]
+    monkeypatch.setattr("mvcore.pipeline.preflight.available_memory", lambda: 100 << 20)
+    assert any("are needed, 0.1 GiB are free" in w for w in preflight(None, rig(4)).warnings)
+    assert any("4.0 GiB are allowed" in w for w in preflight(None, rig(4), max_memory=4 << 30).warnings)
+
+    class Package:
+        def __init__(self, name):
+            self.metadata = {"Name": name}
+
+    monkeypatch.setattr(checks.metadata, "distributions", lambda: map(Package, ["opencv-python", "opencv-python-headless", "numpy"]))
+    assert any("overwrite each other" in w for w in preflight(None, rig(4)).warnings)
+    monkeypatch.setattr(checks.metadata, "distributions", lambda: map(Package, ["opencv-python-headless", "numpy"]))
+    assert not any("overwrite" in w for w in preflight(None, rig(4)).warnings)
+
+
+def test_clips_are_checked_at_both_ends(tmp_path):
+    write_clips(tmp_path, rig(3), [np.eye(4)] * 3)
+    done = mvcore.check(tmp_path)
+    assert (done.errors, done.format, done.outlook.frames) == ([], "clips", 3)
+    clips = load_video(tmp_path)
+    (tmp_path / "images" / "cam01" / "frame0002.png").write_bytes(b"damaged")
+    assert preflight_clips(clips).errors[0].startswith("cam01: ")
+
+
+def test_what_cannot_be_read_is_an_error_not_an_exception(tmp_path):
+    assert "no such file or folder" in mvcore.check(tmp_path / "nowhere", outputs=[tmp_path]).errors[0]
+    assert len(mvcore.check(tmp_path / "nowhere", outputs=[tmp_path]).errors) == 2
+    assert mvcore.check(tmp_path).errors
