@@ -61,7 +61,9 @@ def cameras(*names, size=SIZE):
     return [replace(look_at((2, n, 0), (0, 0, 0), size, 50), name=name) for n, name in enumerate(names)]
 
 
-@pytest.mark.parametrize(("name", "codec"), [("a.mp4", "libx264"), ("a.MTS", "libx264"), ("a.webm", "libvpx"), ("a.avi", "mpeg4")])
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mp4", "libx264"), ("a.MTS", "libx264"), ("a.webm", "libvpx"), ("a.avi", "mpeg4"), ("b.avi", "libx264")]
+)
 def test_any_frame_of_any_container(tmp_path, name, codec):
     path = write_video(tmp_path / name, codec=codec)
     stream = open_stream(path)

@@ -90,11 +90,21 @@ def _scene(path: Path, images: Path | None, allow_outside: bool) -> Scene:
     except (FormatError, FileNotFoundError):
         from ..pipeline.preflight import has_clips
 
-        if has_clips(path):
+        if has_clips(path) and _calibrated(path):
             raise InvalidInputError(f"{path}: expected images of one moment, got clips: use 'mvcore video'") from None
         raise
     shown().warn(scene.warnings)
     return scene
+
+
+def _calibrated(path: Path) -> bool:
+    """Whether a calibration is there, whatever the images are."""
+    from ..io import load
+
+    try:
+        return len(load(path, images=False)) > 0
+    except (FormatError, OSError):
+        return False
 
 
 def _masks(scene: Scene, folder: Path | None) -> Any:

@@ -131,7 +131,8 @@ def preflight(
         check_frames(frames, cameras, notes)
         if masks is not None:
             check_masks(masks, frames, cameras, notes)
-    check_bounds(bounds, cameras, notes)
+    # A mirrored calibration's cameras are those of the reflected world, the caller's box is not.
+    check_bounds(bounds, [] if getattr(calib, "mirrored", False) else cameras, notes)
     check_places(outputs, [*folders, *([workdir] if workdir is not None else [])], notes)
     check_device(settings, notes)
     check_installation(notes)
