@@ -1,6 +1,7 @@
 """Words of the command line, exit codes, what reaches the library."""
 
 import json
+import logging
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -148,6 +149,26 @@ def test_views_by_name_pattern_and_number():
     with pytest.raises(ValueError, match="expected views 0 to 4, got 3-1"):
         select_views(names, only="3-1")
     assert select_views(["", ""], exclude="0") == [1]
+
+
+def test_what_the_library_logs_is_shown_once(folder, tmp_path, calls, monkeypatch):
+    logger = logging.getLogger("mvcore")
+    real = pipeline.reconstruct
+
+    def noisy(*words, **arguments):
+        logger.warning("this was difficult")
+        logger.warning("the light changed")
+        logger.info("a detail")
+        return real(*words, **arguments)
+
+    monkeypatch.setattr(pipeline, "reconstruct", noisy)
+    done = run("reconstruct", folder, "-o", tmp_path / "a.glb", "-v")
+    assert done.stderr.count("warning: this was difficult") == 1
+    assert "warning: the light changed" in done.stderr
+    assert "a detail" in done.stderr
+    done = run("reconstruct", folder, "-o", tmp_path / "a.glb", "--quiet", "--strict")
+    assert (done.exit_code, done.output) == (1, "")
+    assert not [h for h in logger.handlers if type(h).__name__ == "_Logged"]
 
 
 def test_check_prints_and_returns_what_it_finds(folder, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterable, Sequence
 from contextvars import ContextVar
@@ -65,6 +66,21 @@ class Shown:
         return no_track if self.quiet else Progress()
 
 
+class _Logged(logging.Handler):
+    """What the library logs: warnings as they become known, details with ``--verbose``."""
+
+    def __init__(self, shown: Shown) -> None:
+        super().__init__(logging.INFO if shown.verbose else logging.WARNING)
+        self.shown = shown
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Shows a record."""
+        if record.levelno >= logging.WARNING:
+            self.shown.warn([record.getMessage()])
+        else:
+            self.shown.detail(record.getMessage())
+
+
 _current: ContextVar[Shown] = ContextVar("shown")
 
 
@@ -89,11 +105,23 @@ class Commands(TyperGroup):
             if "--debug" in words:
                 raise
             code = _failed(error)
+        finally:
+            _listen(None)
         if code == INTERRUPTED:  # typer makes this code of Ctrl-C, click an exception
             print("interrupted", file=sys.stderr)
         if standalone_mode:
             sys.exit(code if isinstance(code, int) else DONE)
         return code
+
+
+def _listen(shown: Shown | None) -> None:
+    """Has one command, or none, show what the library logs."""
+    logger = logging.getLogger("mvcore")
+    for handler in [h for h in logger.handlers if isinstance(h, _Logged)]:
+        logger.removeHandler(handler)
+    if shown is not None:
+        logger.addHandler(_Logged(shown))
+        logger.setLevel(logging.INFO if shown.verbose else logging.WARNING)
 
 
 def _globals_first(words: list[str]) -> list[str]:
@@ -152,12 +180,9 @@ def options(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
     """These options may stand before or after a command."""
-    _current.set(Shown(verbose, quiet, debug, strict))
-    if verbose:
-        import logging
-
-        logging.basicConfig(stream=sys.stderr, format="%(name)s: %(message)s")
-        logging.getLogger("mvcore").setLevel(logging.INFO)
+    shown = Shown(verbose, quiet, debug, strict)
+    _current.set(shown)
+    _listen(shown)
 
 
 options.__doc__ = app.info.help
