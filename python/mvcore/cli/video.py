@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..errors import InvalidInputError
 from . import options
 from .app import app, shown
+
+if TYPE_CHECKING:
+    from ..io.clips import Clips
 
 
 @app.command()
@@ -50,6 +53,9 @@ def video(
     jobs: options.Jobs = None,
 ) -> None:
     """Synchronised clips in, a textured mesh a frame out."""
+    from ..io import load_video
+    from ..pipeline.preflight import preflight_clips
+
     if target not in ("free", "rigid"):
         raise InvalidInputError(f"--target: expected free or rigid, got {target!r}")
     box = options.parse_box(bounds)
@@ -57,28 +63,22 @@ def video(
     if scheduler is not None and workdir is None:
         workdir = output / "work"  # a temporary folder would be this machine's alone
     how = options.running(workdir, scheduler, max_memory, jobs)
-    from ..io import load_video
-    from ..io.images import find_pictures
-    from ..pipeline.preflight import preflight_clips
-    from ..video.api import reconstruct_video
-
-    choice = {"only": only, "exclude": exclude, "allow_outside": allow_outside}
-    clips = load_video(path if images is None else images, calib or path, rotation=rotate, start=start, stop=stop, stride=stride, **choice)
+    choice = {"only": only, "exclude": exclude, "allow_outside": allow_outside, "rotation": rotate}
+    clips = load_video(path if images is None else images, calib or path, start=start, stop=stop, stride=stride, **choice)
     before = preflight_clips(clips, box, settings, folders=[output], workdir=workdir, max_memory=how.get("max_memory"))
     before.require_good()
     shown().warn(before.warnings)
+    plates = False if background == "none" else background
+    _run(clips, output, masks=masks, background=plates, regions=regions, bounds=box, target=target, config=settings, **how)
+
+
+def _run(clips: Clips, output: Path, *, regions: Path | None, **arguments: Any) -> None:
+    from ..io.images import find_pictures
+    from ..video.api import reconstruct_video
+
     names = [c.name for c in clips.clips]
-    run = reconstruct_video(
-        clips,
-        masks=masks,
-        background=False if background == "none" else background,
-        regions=find_pictures(regions, names) if regions is not None else None,
-        bounds=box,
-        target=target,
-        config=settings,
-        track=shown().track(),
-        **how,
-    )
+    areas = find_pictures(regions, names) if regions is not None else None
+    run = reconstruct_video(clips, regions=areas, track=shown().track(), **arguments)
     run.save(output)
     shown().warn(run.warnings)
     shown().done(f"{output}: {len(run)} instants of {len(names)} cameras, {sum(run.seconds):.0f} s")

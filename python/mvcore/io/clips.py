@@ -155,25 +155,34 @@ def load_video(
     clips = [_clip(name, source) for name, source in sources.items()]
     if calib is None:
         require(not isinstance(path, Mapping), "calib", "cameras for the given clips", None)
-        calib = load(path, images=False, allow_outside=allow_outside).calib  # type: ignore[arg-type]
-    elif isinstance(calib, str | Path):
+        calib = path  # type: ignore[assignment]
+    if isinstance(calib, str | Path):
         calib = load(calib, images=False, allow_outside=allow_outside).calib
-    cameras = list(calib)
+    clips, cameras = _selected(clips, list(calib), only, exclude)  # type: ignore[arg-type]
     warnings: list[str] = []
-    if only is not None or exclude is not None:
-        named = any(c.name for c in cameras)
-        kept = select_views([c.name for c in (cameras if named else clips)], only, exclude)
-        clips, cameras = clips if named else [clips[n] for n in kept], [cameras[n] for n in kept]
     clips = turned(matched(clips, cameras), cameras, rotation, warnings)
     warnings += [f"{c.name}: frames are interlaced: moving edges have teeth" for c in clips if _interlaced(c)]
     cameras = [fitted(clip, camera, warnings) for clip, camera in zip(clips, cameras, strict=True)]
     numbers, times = timeline(clips, offsets or {}, rates, warnings)
-    require(stride >= 1, "stride", "at least 1", stride)
-    chosen = range(len(numbers))[start:stop:stride]
-    if not len(chosen):
-        raise InvalidInputError(f"start, stop: expected instants of 0 .. {len(numbers)}, got {start} .. {stop}")
-    index = np.array(chosen)
+    index = _taken(len(numbers), start, stop, stride)
     return Clips(tuple(clips), Calibration(tuple(cameras)), numbers[index], times[index], numbers, tuple(warnings))
+
+
+def _taken(count: int, start: int, stop: int | None, stride: int) -> NDArray[np.int64]:
+    require(stride >= 1, "stride", "at least 1", stride)
+    chosen = np.arange(count)[start:stop:stride]
+    if not len(chosen):
+        raise InvalidInputError(f"start, stop: expected instants of 0 .. {count}, got {start} .. {stop}")
+    return chosen
+
+
+def _selected(clips: list[Clip], cameras: list[Camera], only: str | None, exclude: str | None) -> tuple[list[Clip], list[Camera]]:
+    """What ``only`` and ``exclude`` leave; of cameras with names the clips are matched afterwards."""
+    if only is None and exclude is None:
+        return clips, cameras
+    named = any(c.name for c in cameras)
+    kept = select_views([c.name for c in (cameras if named else clips)], only, exclude)
+    return clips if named else [clips[n] for n in kept], [cameras[n] for n in kept]
 
 
 def _interlaced(clip: Clip) -> bool:

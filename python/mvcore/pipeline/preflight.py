@@ -35,13 +35,15 @@ from .checks import (
     check_places,
 )
 
-CPU_SECONDS = {"sgm": 22.0, "dcnn": 45.0}
-"""CPU seconds that a reconstruction takes a view and megapixel, by matcher; measured on photographs, good to a factor of two."""
+VIEW_SECONDS = 1.0
+"""CPU seconds that a view takes whatever its size: the sweep runs on a small image."""
+PIXEL_SECONDS = {"sgm": 25.0, "dcnn": 50.0}
+"""CPU seconds a megapixel of a view, by matcher. Both measured on the bundled sample; good to a factor of two."""
 VIEW_BYTES = 60
 """Bytes a pixel and view that stay in memory through a run: the image, depth and confidence before and after the filter."""
 TASK_BYTES = 400
 """Bytes a pixel of the view that is being worked on, for each of the views in work."""
-BASE_BYTES = 400 << 20
+BASE_BYTES = 250 << 20
 """Bytes of a process with its libraries before any image."""
 
 
@@ -242,12 +244,12 @@ def _outlook(cameras: Sequence[Camera], config: Config, moments: int) -> Outlook
     sizes = [(round(c.width * s), round(c.height * s)) for c, s in zip(cameras, scales, strict=True)]
     pixels = np.array([w * h for w, h in sizes], float)
     sources = candidate_sources(cameras, config)
-    used = float(sum(p for p, s in zip(pixels, sources, strict=True) if s)) / 1e6
+    used = [p / 1e6 for p, s in zip(pixels, sources, strict=True) if s]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    minutes = CPU_SECONDS[config.matcher] * used * moments / cores / 60
+    seconds = VIEW_SECONDS * len(used) + PIXEL_SECONDS[config.matcher] * float(sum(used))
     memory = BASE_BYTES + int(VIEW_BYTES * pixels.sum() + TASK_BYTES * pixels.max())
     width, height = sizes[int(pixels.argmax())]
-    return Outlook(len(cameras), moments, width, height, sources, cores, round(minutes, 2), memory)
+    return Outlook(len(cameras), moments, width, height, sources, cores, round(seconds * moments / cores / 60, 2), memory)
 
 
 def candidate_sources(cameras: Sequence[Camera], config: Config) -> tuple[tuple[int, ...], ...]:
