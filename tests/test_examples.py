@@ -53,7 +53,10 @@ def test_the_descent_example_gains_by_moving_knots(tmp_path):
     assert (tmp_path / "a.obj").is_file()
 
 
-@pytest.mark.parametrize("module", ["geometry.cameras", "silhouettes.visual_hull", "config", "depth.stereo", "io.clips", "mesh.surface"])
+DOCUMENTED = ["geometry.cameras", "silhouettes.visual_hull", "config", "depth.stereo", "io.clips", "io.selection", "mesh.surface"]
+
+
+@pytest.mark.parametrize("module", [*DOCUMENTED, "pipeline.preflight"])
 def test_docstrings(module):
     result = doctest.testmod(importlib.import_module(f"mvcore.{module}"), extraglobs={"np": np})
     assert result.attempted > 0

@@ -121,7 +121,7 @@ def test_bounds_must_be_a_box_that_is_seen():
         ([1, 2], "2 values"),
         ([1, 1, 1, 0, 0, 0], "x0 < x1"),
         ([0, 0, 0, 1, 1, float("nan")], "x0 < x1"),
-        ("abc", "could not convert"),
+        ("abc", "expected ((x0, y0, z0), (x1, y1, z1)), got 'abc'"),
         ([1000, 1000, 1000, 1001, 1001, 1001], "no camera sees"),
     ):
         assert part in preflight(None, cameras, bounds=box).errors[0]

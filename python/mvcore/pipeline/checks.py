@@ -17,7 +17,7 @@ from ..errors import InvalidInputError, MvcoreError, require
 from ..geometry.cameras import Calibration, Camera, same_shape
 from ..io.decode import read_header
 from ..io.images import find_masks, load_mask, mask_warnings
-from ..types import Frame
+from ..types import Bounds, Frame
 
 MOST_MASKS = 200
 """Masks that are looked at, spread over all."""
@@ -145,17 +145,34 @@ def check_masks(masks: Sequence[Frame | None] | str | Path, frames: Sequence[Fra
         notes.error("masks", "all are empty: expected bright pixels where the target is")
 
 
-def check_bounds(bounds: ArrayLike | None, cameras: Sequence[Camera], notes: Findings) -> None:
-    """A box in the world that a camera sees."""
+def as_box(bounds: ArrayLike | None) -> Bounds | None:
+    """A caller's box as (2, 3), or None.
+
+    Raises
+    ------
+    InvalidInputError
+        Not six finite numbers, the lesser corner first.
+    """
     if bounds is None:
-        return
+        return None
     try:
         box = np.asarray(bounds, np.float64)
-        require(box.size == 6, "bounds", "((x0, y0, z0), (x1, y1, z1))", f"{box.size} values")
-        box = box.reshape(2, 3)
-        require(np.isfinite(box).all() and (box[0] < box[1]).all(), "bounds", "x0 < x1, y0 < y1, z0 < z1", box.tolist())
-    except (InvalidInputError, ValueError, TypeError) as error:
+    except (ValueError, TypeError):
+        raise InvalidInputError(f"bounds: expected ((x0, y0, z0), (x1, y1, z1)), got {str(bounds)[:60]!r}") from None
+    require(box.size == 6, "bounds", "((x0, y0, z0), (x1, y1, z1))", f"{box.size} values")
+    box = box.reshape(2, 3)
+    require(np.isfinite(box).all() and (box[0] < box[1]).all(), "bounds", "x0 < x1, y0 < y1, z0 < z1", box.tolist())
+    return box
+
+
+def check_bounds(bounds: ArrayLike | None, cameras: Sequence[Camera], notes: Findings) -> None:
+    """A box in the world that a camera sees."""
+    try:
+        box = as_box(bounds)
+    except InvalidInputError as error:
         notes.error("bounds", error)
+        return
+    if box is None:
         return
     corners = np.stack(np.meshgrid(*[np.linspace(*side, 5) for side in box.T], indexing="ij"), -1).reshape(-1, 3)
     if len(cameras) and not any(_sees(c, corners) for c in cameras):

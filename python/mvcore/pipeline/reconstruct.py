@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from ..config import Config
@@ -19,6 +18,7 @@ from ..io import load
 from ..io.images import find_masks
 from ..io.scene import Scene
 from ..types import Bounds, Frame, SparsePoints, Track, no_track
+from .checks import as_box
 from .graph import FrameTasks, Inputs, Run, Views, cropped, frame_tasks, located, overview, planned, reduced_cameras, run_frame, surveyed
 from .report import assembled
 from .result import Reconstruction
@@ -32,17 +32,6 @@ def as_calibration(calib: Calibration | Sequence[Camera] | str | Path) -> Calibr
     if isinstance(calib, str | Path):
         return load(calib, images=False).calib
     return calib if isinstance(calib, Calibration) else Calibration(tuple(calib))
-
-
-def check_bounds(bounds: ArrayLike | None) -> Bounds | None:
-    """A caller's box as (2, 3), checked."""
-    if bounds is None:
-        return None
-    box = np.asarray(bounds, np.float64)
-    require(box.size == 6, "bounds", "((x0, y0, z0), (x1, y1, z1))", f"{box.size} values")
-    box = box.reshape(2, 3)
-    require(np.isfinite(box).all() and (box[0] < box[1]).all(), "bounds", "x0 < x1, y0 < y1, z0 < z1", box.tolist())
-    return box
 
 
 def reconstruct(
@@ -119,7 +108,7 @@ def _request(frames: Any, calib: Any, masks: Any, bounds: ArrayLike | None) -> _
     calib = as_calibration(calib)
     require(len(frames) == len(calib), "frames", f"{len(calib)}, one a camera", len(frames))
     calib.check_baselines()
-    box = check_bounds(bounds)
+    box = as_box(bounds)
     if isinstance(masks, str | Path):
         masks = find_masks(masks, frames)
     require(masks is None or len(masks) == len(frames), "masks", f"{len(frames)}, one a frame", len(masks or ()))

@@ -17,7 +17,7 @@ from ..geometry.cameras import Calibration, Camera
 from ..geometry.local_frame import LocalFrame
 from ..io.clips import Clips, Source, load_video
 from ..io.images import find_pictures, read_image, undistort
-from ..pipeline.reconstruct import check_bounds
+from ..pipeline.checks import as_box
 from ..pipeline.result import Reconstruction
 from ..types import Image, Track, no_track
 from .run import ClipRun, Job
@@ -125,7 +125,7 @@ def _job(clips: Any, calib: Any, masks: Any, background: Any, regions: Any, boun
         clips = with_calibration(clips, calib)
     clips.calib.check_baselines()
     plates = [None] * len(clips.clips) if background is False else _plates(clips, background)
-    frame, box = LocalFrame.of(clips.calib), check_bounds(bounds)
+    frame, box = LocalFrame.of(clips.calib), as_box(bounds)
     return Job(
         clips,
         None if masks is None else _mask_clips(masks, clips),
