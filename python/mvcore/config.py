@@ -215,20 +215,23 @@ class SurfaceConfig:
 
 @dataclass(frozen=True)
 class TextureConfig:
-    """Photographs onto the mesh."""
+    """Images onto the mesh."""
 
+    candidates: int = 8
+    """Views that are kept for each face, the best by resolution and contrast: memory and cost do not grow with the views beyond."""
     seam: float = 0.5
     """Cost of a seam along one edge against the best and the worst view of a face (1)."""
     outlier: float = 60.0
-    """Grey levels by which a view may differ from the median of all: beyond, it shows an occluder or a highlight."""
+    """Grey levels, after the colour gains, by which a view may differ from the median of a face's: beyond, it shows an occluder or a
+    highlight."""
     loyalty: float = 0.5
-    """Share by which a face's photograph at the instant before counts as better: it changes only where another is clearly better."""
+    """Share by which the view that a face had in the frame before counts as better: it changes only where another is clearly better."""
     least_patch: int = 32
     """Faces below which a patch takes its neighbour's view."""
     mask_erosion: int = 3
     """Pixels taken off the masks: their borders mix in background."""
     max_size: int = 8192
-    """Texels a side of the atlas; photographs are reduced until it fits."""
+    """Texels a side of the atlas; images are reduced until it fits."""
     padding_depth: float = 2.0
     """Voxels by which a vertex may lie behind the z-buffer and still count as seen."""
 
