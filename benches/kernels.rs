@@ -6,8 +6,10 @@
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use mvcore::aggregate::{Penalties, aggregate};
-use mvcore::atlas::{Source, build_atlas};
+use mvcore::atlas::Atlas;
+use mvcore::candidates::Candidates;
 use mvcore::carve::{CarveParams, Silhouette, carve};
+use mvcore::compare_views::compare_views;
 use mvcore::consistency::{ConsistencyParams, OtherView, consistency};
 use mvcore::expect::expect;
 use mvcore::fuse::{FusionParams, FusionView, fuse};
@@ -22,7 +24,8 @@ use mvcore::nurbs::{self, Knots, Net};
 use mvcore::photo_carve::{Photo as Coloured, PhotoParams, photo_carve};
 use mvcore::raster::{Epipolar, Raster};
 use mvcore::rasterize::rasterize;
-use mvcore::select_views::{Photo, SelectParams, rate, select_views};
+use mvcore::rate_faces::{Photo, rate_faces};
+use mvcore::select_views::{SelectParams, select_views};
 use mvcore::shade::{Shots, Surface};
 use mvcore::slanted::{Hypothesis, RefineParams, refine};
 use mvcore::sweep::sweep;
@@ -305,21 +308,32 @@ fn meshes(c: &mut Criterion) {
         projection: p,
         center,
     };
-    group.bench_function("rate", |b| b.iter(|| rate(mesh, &photo, 0.02).unwrap()));
-    let ratings: Vec<_> = (0..8)
-        .map(|k| {
-            let (p, center) = ring(8, k, w, h, focal);
-            let (depth, _) = rasterize(mesh, &p, w, h).unwrap();
-            let depth = Raster::new(&depth, w, h, "depth").unwrap();
-            rate(mesh, &Photo { depth, projection: p, center, ..photo }, 0.02).unwrap()
-        })
-        .collect();
+    group.bench_function("rate_faces", |b| b.iter(|| rate_faces(mesh, &photo, 0.02).unwrap()));
+    let n = 8 * surface.faces.len();
+    let (mut views, mut qualities, mut colours) = (vec![-1i16; n], vec![0f32; n], vec![[0u8; 3]; n]);
+    let mut lists = Candidates::new(8, &mut views, &mut qualities, &mut colours).unwrap();
+    for k in 0..8 {
+        let (p, center) = ring(8, k, w, h, focal);
+        let (depth, _) = rasterize(mesh, &p, w, h).unwrap();
+        let depth = Raster::new(&depth, w, h, "depth").unwrap();
+        let rated = rate_faces(mesh, &Photo { depth, projection: p, center, ..photo }, 0.02).unwrap();
+        lists.keep_best(k as i16, &rated.quality, &rated.colour).unwrap();
+    }
+    group.bench_function("compare_views, 8 views", |b| b.iter(|| compare_views(&lists, 8, 2000).unwrap()));
     let params = SelectParams { seam: 0.5, outlier: 60.0, least_patch: 32 };
-    group.bench_function("select_views, 8 views", |b| b.iter(|| select_views(mesh, &ratings, &params).unwrap()));
-    let labels = select_views(mesh, &ratings, &params).unwrap();
-    let sources: Vec<_> =
-        (0..8).map(|k| Source { rgb: image, projection: ring(8, k, w, h, focal).0, gain: [1.0; 3] }).collect();
-    group.bench_function("build_atlas, 8 views", |b| b.iter(|| build_atlas(mesh, &labels, &sources, 8192).unwrap()));
+    let gains = [[1.0; 3]; 8];
+    group.bench_function("select_views, 8 views", |b| {
+        b.iter(|| select_views(mesh, &mut lists, &gains, &params).unwrap());
+    });
+    let labels = select_views(mesh, &mut lists, &gains, &params).unwrap();
+    let matrices: Vec<_> = (0..8).map(|k| ring(8, k, w, h, focal).0).collect();
+    group.bench_function("atlas, 8 views", |b| {
+        b.iter(|| {
+            let mut atlas = Atlas::plan(mesh, &labels, &matrices).unwrap();
+            (0..8).for_each(|k| atlas.add_view(k, &image).unwrap());
+            atlas.finish(&gains).unwrap()
+        });
+    });
     // Every thirtieth face is missing: some twenty thousand small holes.
     let kept: Vec<[u32; 3]> = surface.faces.iter().enumerate().filter(|(n, _)| n % 30 > 0).map(|(_, &f)| f).collect();
     let porous = Mesh::new(&vertices, &kept).unwrap();

@@ -87,3 +87,33 @@ def weighted_median(values, guide, doubtful, radius, step, colour, distance, sla
             if doubtful[y, x] or np.isnan(values[y, x]) or abs(median - values[y, x]) > slack:
                 out[y, x] = median
     return out
+
+
+def best_views(qualities, colours, slots):
+    """Of (V, F) qualities and (V, F, 3) colours the best ``slots`` views of each face: a list of {view: (quality, colour)}."""
+    lists = []
+    for f in range(qualities.shape[1]):
+        order = sorted(np.flatnonzero(qualities[:, f]), key=lambda v: (-qualities[v, f], v))[:slots]
+        lists.append({int(v): (qualities[v, f], tuple(colours[v, f])) for v in order})
+    return lists
+
+
+def compare_views(lists):
+    """{(a, b): (faces, median log ratio a / b)} over faces that are neither dark nor saturated in both."""
+    ratios = {}
+    for views in lists:
+        usable = {v: np.log(np.float32(c)) for v, (_, c) in views.items() if min(c) > 12 and max(c) < 245}
+        for a in usable:
+            for b in usable:
+                if a < b:
+                    ratios.setdefault((a, b), []).append(usable[a] - usable[b])
+    return {pair: (len(r), np.median(r, axis=0)) for pair, r in ratios.items()}
+
+
+def outliers(views, gains, outlier):
+    """Views of one face whose colour, gains applied, is far from the upper median of at least three."""
+    if len(views) < 3:
+        return set()
+    levels = {v: np.float32(c) * gains[v] for v, (_, c) in views.items()}
+    median = np.sort(np.array(list(levels.values())), axis=0)[len(levels) // 2]
+    return {v for v, level in levels.items() if (np.abs(level - median) > outlier).any()}

@@ -34,7 +34,6 @@ from mvcore.mesh.surface import (
     marching_cubes,
     smooth,
 )
-from mvcore.mesh.texture import colour_gains, texture
 from mvcore.silhouettes.occluder_repair import repaired_masks
 from mvcore.sparse.calibration_check import CalibrationError, calibration_error, check_calibration
 from mvcore.sparse.features import candidate_pairs, detect
@@ -464,32 +463,6 @@ def test_an_empty_field_is_an_error():
     volume = Volume(np.zeros(3), 1.0, (8, 8, 8), np.zeros((1, 3), np.uint32), np.ones((1, 8, 8, 8), np.float32))
     with pytest.raises(ReconstructionError, match="no surface"):
         extract_surface(volume, SurfaceConfig())
-
-
-def test_gains_bring_exposures_together():
-    rng = np.random.default_rng(0)
-    base = rng.integers(60, 160, (500, 3))
-    factors = np.array([0.8, 1.0, 1.25])
-    colours = [np.clip(base * f, 0, 255).astype(np.uint8) for f in factors]
-    gains = colour_gains([np.ones(500, np.float32)] * 3, colours)
-    assert np.allclose(gains[:, 0] * factors, (gains[:, 0] * factors).mean(), rtol=0.03)
-
-
-def test_texture_shows_the_photographs(ring):
-    from mvcore.evaluation import metrics
-
-    cameras, images, _, _ = ring
-    scaled = ball()
-    surface = Surface((scaled.vertices - scaled.vertices.mean(0)) / 14 * 0.5, scaled.faces)
-    textured = texture(surface, images[1:], cameras[1:])
-
-    class Mesh:
-        vertices, faces, uv, texture = textured.vertices, textured.faces, textured.uv, textured.atlas
-
-    figures = metrics.photo_metrics(Mesh, images[0], cameras[0], ring[3][0])
-    assert figures["coverage"] > 0.98
-    assert figures["psnr_hit"] > 24
-    assert (textured.view < 0).mean() < 0.2  # the poles, which no camera sees
 
 
 def test_chance_patches_of_a_disparity_map_are_told_from_thin_things():

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "Atlas",
     "aggregate",
-    "build_atlas",
     "carve",
     "close_holes",
+    "compare_views",
     "components",
     "consistency",
     "correlate",
@@ -18,6 +19,7 @@ __all__ = [
     "fuse",
     "isosurface_dense",
     "isosurface_sparse",
+    "keep_best",
     "match_epipolar",
     "nearest",
     "nurbs_basis",
@@ -44,6 +46,7 @@ _F32 = NDArray[np.float32]
 _F64 = NDArray[np.float64]
 _U8 = NDArray[np.uint8]
 _U32 = NDArray[np.uint32]
+_I16 = NDArray[np.int16]
 _I32 = NDArray[np.int32]
 _I64 = NDArray[np.int64]
 
@@ -166,24 +169,33 @@ def rate_faces(
     center: Sequence[float],
     tolerance: float,
 ) -> tuple[_F32, _U8]: ...
+def keep_best(view: int, quality: _F32, colour: _U8, views: _I16, qualities: _F32, colours: _U8) -> None: ...
+def compare_views(views: _I16, qualities: _F32, colours: _U8, count: int, sample: int) -> tuple[_I32, _U32, _F32]: ...
 def select_views(
     vertices: _F64,
     faces: _U32,
-    qualities: Sequence[_F32],
-    colours: Sequence[_U8],
+    views: _I16,
+    qualities: _F32,
+    colours: _U8,
+    gains: _F32,
     seam: float,
     outlier: float,
     least_patch: int,
 ) -> _I32: ...
-def build_atlas(
-    vertices: _F64,
-    faces: _U32,
-    labels: _I32,
-    images: Sequence[_U8],
-    matrices: Sequence[_F64],
-    gains: Sequence[Sequence[float]],
-    max_size: int,
-) -> tuple[_U32, _F32, _U32, _U8]: ...
+
+class Atlas:
+    """A texture atlas in the making; once finished it is empty."""
+
+    def __new__(cls, vertices: _F64, faces: _U32, labels: _I32, matrices: _F64) -> Atlas: ...
+    @property
+    def size(self) -> tuple[int, int]:
+        """Most texels (height, width) that it can have."""
+    @property
+    def views(self) -> list[int]:
+        """The views that have charts, ascending."""
+    def add_view(self, view: int, image: _U8) -> None: ...
+    def finish(self, gains: _F32) -> tuple[_U32, _F32, _U32, _U8]: ...
+
 def encode_png(rgb: _U8) -> bytes: ...
 def read_obj(path: str) -> tuple[_F64, _U32]: ...
 def nurbs_basis(knots: _F64, count: int, u: _F64, order: int) -> tuple[_I64, _F64]: ...

@@ -291,20 +291,23 @@ class SurfaceConfig(Checked):
 
 @dataclass(frozen=True)
 class TextureConfig(Checked):
-    """Photographs onto the mesh."""
+    """Images onto the mesh."""
 
+    candidates: Annotated[int, within(1, 64, "views")] = 8
+    """Views that are kept for each face, the best by resolution and contrast: memory and cost do not grow with the views beyond."""
     seam: Annotated[float, within(0, 1000, "cost")] = 0.5
     """Cost of a seam along one edge against the best and the worst view of a face (1)."""
     outlier: Annotated[float, within(0, 1000, "grey levels")] = 60.0
-    """Grey levels by which a view may differ from the median of all: beyond, it shows an occluder or a highlight."""
+    """Grey levels, after the colour gains, by which a view may differ from the median of a face's: beyond, it shows an occluder or a
+    highlight."""
     loyalty: Annotated[float, within(0, 1, "share")] = 0.5
-    """Share by which a face's photograph at the instant before counts as better: it changes only where another is clearly better."""
+    """Share by which the view that a face had in the frame before counts as better: it changes only where another is clearly better."""
     least_patch: Annotated[int, within(0, 1_000_000_000, "faces")] = 32
     """Faces below which a patch takes its neighbour's view."""
     mask_erosion: Annotated[int, within(0, 1000, "pixels")] = 3
     """Pixels taken off the masks: their borders mix in background."""
     max_size: Annotated[int, within(16, 65_536, "texels")] = 8192
-    """Texels a side of the atlas; photographs are reduced until it fits."""
+    """Texels a side of the atlas; images are reduced until it fits."""
     padding_depth: Annotated[float, within(0, 1000, "voxels")] = 2.0
     """Voxels by which a vertex may lie behind the z-buffer and still count as seen."""
 

@@ -21,7 +21,7 @@ from ..geometry.cameras import Camera
 from ..io.images import mask_warnings, reduce, undistort
 from ..mesh.hull_parts import Hulls, find_targets, motions, moved, on_targets
 from ..mesh.surface import Surface, cleaned, drop_cavities, drop_unseen, isosurface
-from ..mesh.texture import Given, texture
+from ..mesh.texture import TexturePrior, texture
 from ..silhouettes.background_subtraction import Background, foreground, learn_backgrounds
 from ..silhouettes.object_segmentation import Standing, find_standing
 from ..silhouettes.visual_hull import shadow, target_hull
@@ -607,17 +607,16 @@ def paint(
     config: TextureConfig,
 ) -> Textured:
     """The mesh with its texture. ``settled`` settles the colours, ``prior`` where its surface is the image of each face if it can."""
-    report = Report()
-    known = Given()
+    known = TexturePrior()
     if settled is not None:
         known = replace(known, gains=settled.gains)
     if prior is not None:
         known = replace(known, centers=prior.centers, views=prior.face_views)
     masks = _Masks(pixels) if rig.masked else None
-    found = texture(mesh.surface, _Images(pixels), rig.cameras, masks, extracted.voxel, config, report, given=known)
-    report.values["texture"]["gains"] = found.gains.tolist()
-    report.values["mesh"] = {"vertices": len(found.vertices), "faces": len(found.faces)}
-    return Textured(found.vertices, found.faces, found.uv, found.atlas, found.view, found.gains, Findings.of(report))
+    done = texture(mesh.surface, _Images(pixels), rig.cameras, masks, extracted.voxel, config, prior=known)
+    figures = {"texture": done.figures, "mesh": {"vertices": len(done.vertices), "faces": len(done.faces)}}
+    findings = Findings(figures, list(done.warnings))
+    return Textured(done.vertices, done.faces, done.uv, done.atlas, done.view, done.gains, findings)
 
 
 # ---- clips ------------------------------------------------------------------------------------------------------------

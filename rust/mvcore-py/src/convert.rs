@@ -4,7 +4,8 @@ use mvcore::raster::{Epipolar, Raster};
 use mvcore::{Error, Result};
 use ndarray::{Array, Dimension, IntoDimension};
 use numpy::{
-    Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+    Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3, PyReadwriteArray,
+    PyUntypedArrayMethods,
 };
 use pyo3::exceptions::{PyMemoryError, PyValueError};
 use pyo3::prelude::*;
@@ -37,6 +38,18 @@ pub fn slice<'a, T: Element, D: Dimension>(
 ) -> PyResult<&'a [T]> {
     let values = array.as_slice().ok().filter(|_| array.is_c_contiguous());
     values.ok_or_else(|| unfit(array.py(), argument, "a C-contiguous array", "another"))
+}
+
+/// A contiguous array's values to be changed, or an error naming the argument.
+pub fn slice_mut<'a, T: Element, D: Dimension>(
+    array: &'a mut PyReadwriteArray<'_, T, D>,
+    argument: &'static str,
+) -> PyResult<&'a mut [T]> {
+    let error = || PyValueError::new_err(format!("{argument}: expected a C-contiguous array"));
+    if !array.is_c_contiguous() {
+        return Err(error());
+    }
+    array.as_slice_mut().map_err(|_| error())
 }
 
 /// A picture (h, w, 3) as a raster of its bytes, 3 w a row.

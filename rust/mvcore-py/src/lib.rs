@@ -25,7 +25,7 @@ mod _core {
     #[pymodule_export]
     use crate::sparse::match_epipolar;
     #[pymodule_export]
-    use crate::texture::{build_atlas, rasterize, rate_faces, select_views, shade};
+    use crate::texture::{Atlas, compare_views, keep_best, rasterize, rate_faces, select_views, shade};
     #[pymodule_export]
     use crate::volume::{
         carve, close_holes, components, consistency, fuse, isosurface_dense, isosurface_sparse, nearest, photo_carve,

@@ -8,6 +8,8 @@
 //! Corrections vary slowly, so a lattice far coarser than the mesh carries them: a hundredth of the unknowns of one a vertex. Lempitsky and
 //! Ivanov, CVPR 2007. Sums run in a fixed order: the same bytes for any number of threads.
 
+use rayon::prelude::*;
+
 /// Pixels between the nodes.
 const STEP: f64 = 8.0;
 /// Pull of neighbouring nodes towards each other, relative to a seam vertex's pull.
@@ -16,13 +18,19 @@ const SMOOTHNESS: f64 = 0.1;
 const ANCHOR: f64 = 0.03;
 const MOST_ITERATIONS: usize = 100;
 
-/// Corrections at vertices: `part` is each vertex's chart, `pixel` its place in the chart's photograph; a seam (a, b, jump) asks that
-/// correction a minus correction b be the jump.
-pub fn level(part: &[u32], pixel: &[[f64; 2]], seams: &[(u32, u32, [f64; 3])]) -> Vec<[f64; 3]> {
+/// Corrections at vertices: `part` is each vertex's chart, `pixel` its place in the chart's image; a seam (a, b, jump) asks that correction
+/// a minus correction b be the jump.
+pub fn level(part: &[u32], pixel: &[[f64; 2]], seams: &[(u32, u32, [f32; 3])]) -> Vec<[f32; 3]> {
     let lattice = Lattice::new(part, pixel);
-    let x = lattice.solve(seams);
-    lattice.places.iter().map(|p| p.value(&x)).collect()
+    let place = |v: u32| lattice.place(part[v as usize], pixel[v as usize]);
+    let seams: Vec<Seam> = seams.iter().map(|&(a, b, jump)| (place(a), place(b), jump.map(f64::from))).collect();
+    let x = lattice.solve(&seams);
+    let value = |(&part, &pixel): (&u32, &[f64; 2])| lattice.place(part, pixel).value(&x).map(|c| c as f32);
+    part.par_iter().zip(pixel).map(value).collect()
 }
+
+/// Two places of a vertex and the jump between them.
+type Seam = (Place, Place, [f64; 3]);
 
 /// A vertex between four nodes.
 struct Place {
@@ -36,8 +44,14 @@ impl Place {
     }
 }
 
+/// Chart, column and row.
+type Cell = (u32, i32, i32);
+
 struct Lattice {
-    places: Vec<Place>,
+    /// Ascending.
+    cells: Vec<Cell>,
+    /// The nodes at the corners of each cell.
+    corners: Vec<[u32; 4]>,
     /// Neighbouring nodes, each pair once.
     links: Vec<(u32, u32)>,
     count: usize,
@@ -45,34 +59,31 @@ struct Lattice {
 
 impl Lattice {
     fn new(part: &[u32], pixel: &[[f64; 2]]) -> Self {
-        let cell = |v: usize| {
-            let [x, y] = pixel[v].map(|p| (p / STEP).floor());
-            (part[v], x as i32, y as i32)
-        };
-        let corners = |(p, x, y): (u32, i32, i32)| [(p, x, y), (p, x + 1, y), (p, x, y + 1), (p, x + 1, y + 1)];
-        let mut cells: Vec<_> = (0..part.len()).map(cell).collect();
-        let own = cells.clone();
-        cells.sort_unstable();
+        let around = |(p, x, y): Cell| [(p, x, y), (p, x + 1, y), (p, x, y + 1), (p, x + 1, y + 1)];
+        let mut cells: Vec<Cell> = part.par_iter().zip(pixel).map(|(&p, &q)| cell(p, q)).collect();
+        cells.par_sort_unstable();
         cells.dedup();
-        let mut nodes: Vec<_> = cells.iter().flat_map(|&c| corners(c)).collect();
-        nodes.sort_unstable();
+        let mut nodes: Vec<Cell> = cells.iter().flat_map(|&c| around(c)).collect();
+        nodes.par_sort_unstable();
         nodes.dedup();
-        let number = |node: &(u32, i32, i32)| nodes.binary_search(node).map_or(0, |n| n as u32);
-        let of_cell: Vec<[u32; 4]> = cells.iter().map(|&c| corners(c).each_ref().map(number)).collect();
+        let number = |node: &Cell| nodes.binary_search(node).map_or(0, |n| n as u32);
+        let corners: Vec<[u32; 4]> = cells.par_iter().map(|&c| around(c).each_ref().map(number)).collect();
         let mut links: Vec<(u32, u32)> =
-            of_cell.iter().flat_map(|n| [(n[0], n[1]), (n[2], n[3]), (n[0], n[2]), (n[1], n[3])]).collect();
-        links.sort_unstable();
+            corners.iter().flat_map(|n| [(n[0], n[1]), (n[2], n[3]), (n[0], n[2]), (n[1], n[3])]).collect();
+        links.par_sort_unstable();
         links.dedup();
-        let place = |(v, c): (usize, &(u32, i32, i32))| {
-            let node = cells.binary_search(c).map_or([0; 4], |n| of_cell[n]);
-            let (a, b) = (pixel[v][0] / STEP - f64::from(c.1), pixel[v][1] / STEP - f64::from(c.2));
-            Place { node, weight: [(1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b] }
-        };
-        Self { places: own.iter().enumerate().map(place).collect(), links, count: nodes.len() }
+        Self { cells, corners, links, count: nodes.len() }
+    }
+
+    fn place(&self, part: u32, pixel: [f64; 2]) -> Place {
+        let cell = cell(part, pixel);
+        let node = self.cells.binary_search(&cell).map_or([0; 4], |n| self.corners[n]);
+        let (a, b) = (pixel[0] / STEP - f64::from(cell.1), pixel[1] / STEP - f64::from(cell.2));
+        Place { node, weight: [(1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b] }
     }
 
     /// Conjugate gradients with a diagonal preconditioner, three channels at once.
-    fn solve(&self, seams: &[(u32, u32, [f64; 3])]) -> Vec<[f64; 3]> {
+    fn solve(&self, seams: &[Seam]) -> Vec<[f64; 3]> {
         let n = self.count;
         let (mut diagonal, mut r) = (vec![ANCHOR; n], vec![[0.0; 3]; n]);
         for &(i, j) in &self.links {
@@ -80,8 +91,7 @@ impl Lattice {
             diagonal[j as usize] += SMOOTHNESS;
         }
         for (a, b, jump) in seams {
-            for (v, sign) in [(a, 1.0), (b, -1.0)] {
-                let place = &self.places[*v as usize];
+            for (place, sign) in [(a, 1.0), (b, -1.0)] {
                 for (&i, w) in place.node.iter().zip(place.weight) {
                     diagonal[i as usize] += w * w;
                     (0..3).for_each(|c| r[i as usize][c] += sign * w * jump[c]);
@@ -98,8 +108,7 @@ impl Lattice {
                     y[j][c] -= pull;
                 }
             }
-            for (a, b, _) in seams {
-                let (pa, pb) = (&self.places[*a as usize], &self.places[*b as usize]);
+            for (pa, pb, _) in seams {
                 let (va, vb) = (pa.value(x), pb.value(x));
                 let gap: [f64; 3] = std::array::from_fn(|c| va[c] - vb[c]);
                 for k in 0..4 {
@@ -144,6 +153,11 @@ impl Lattice {
         }
         x
     }
+}
+
+fn cell(part: u32, pixel: [f64; 2]) -> Cell {
+    let [x, y] = pixel.map(|p| (p / STEP).floor() as i32);
+    (part, x, y)
 }
 
 #[cfg(test)]

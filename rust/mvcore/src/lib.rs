@@ -1,13 +1,15 @@
 //! Multi-view stereo kernels in plain Rust: arrays in, arrays out, no Python, no I/O beyond mesh and atlas files.
 //!
-//! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`]) ← one file a kernel. Six kernels stand on a part
+//! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`], [`candidates`]) ← one file a kernel. Six kernels stand on a part
 //! of their own: [`slanted`] and [`sweep`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`], [`atlas`] on
-//! [`pack`] and [`level`]; no other calls another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's
+//! [`pack`], [`level`] and [`palette`]; no other calls another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's
 //! global pool; every kernel gives the same bytes for any number of them.
 
 pub mod aggregate;
 pub mod atlas;
+pub mod candidates;
 pub mod carve;
+pub mod compare_views;
 pub mod consistency;
 pub mod correlate;
 pub mod cube;
@@ -27,10 +29,12 @@ pub mod mesh;
 pub mod nearest;
 pub mod nurbs;
 pub mod pack;
+pub mod palette;
 pub mod patch;
 pub mod photo_carve;
 pub mod raster;
 pub mod rasterize;
+pub mod rate_faces;
 pub mod select_views;
 pub mod shade;
 pub mod slanted;

@@ -1,13 +1,13 @@
 //! Skyline packing of rectangles.
 
-/// Where each rectangle (width, height) goes in a square-ish area, tallest first, and the area's size; `extra` more units of area follow
-/// below, in rows of the same width. The width is a multiple of 64 and at least `least`.
-pub fn pack(sizes: &[(usize, usize)], extra: usize, least: usize) -> (Vec<(usize, usize)>, usize, usize) {
+/// Where each rectangle (width, height) goes in a square-ish area, tallest first, and the area's size. The width is a multiple of 64 and at
+/// least `least`.
+pub fn pack(sizes: &[(usize, usize)], least: usize) -> (Vec<(usize, usize)>, usize, usize) {
     let mut order: Vec<usize> = (0..sizes.len()).filter(|&c| sizes[c].0 > 0).collect();
     order.sort_by_key(|&c| (std::cmp::Reverse(sizes[c].1), std::cmp::Reverse(sizes[c].0), c));
     let area: usize = sizes.iter().map(|s| s.0 * s.1).sum();
     let widest = sizes.iter().map(|s| s.0).max().unwrap_or(0).max(least);
-    let width = widest.max(((area + extra) as f64).sqrt() as usize + least).next_multiple_of(64);
+    let width = widest.max((area as f64).sqrt() as usize + least).next_multiple_of(64);
     let mut places = vec![(0, 0); sizes.len()];
     // The skyline: (x, height) of each step, x ascending.
     let mut line = vec![(0usize, 0usize)];
@@ -47,7 +47,7 @@ mod tests {
     proptest! {
         #[test]
         fn rectangles_do_not_overlap(sizes in prop::collection::vec((1usize..40, 1usize..30), 1..200)) {
-            let (places, width, height) = pack(&sizes, 0, 4);
+            let (places, width, height) = pack(&sizes, 4);
             let mut taken = vec![false; width * height];
             for (&(x0, y0), &(w, h)) in places.iter().zip(&sizes) {
                 for y in y0..y0 + h {
@@ -63,6 +63,6 @@ mod tests {
 
     #[test]
     fn nothing_takes_no_rows() {
-        assert_eq!(pack(&[], 100, 4), (vec![], 64, 0));
+        assert_eq!(pack(&[], 4), (vec![], 64, 0));
     }
 }

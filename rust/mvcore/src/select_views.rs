@@ -1,96 +1,24 @@
-//! Which photograph textures which face: a labelling with few seams.
+//! Which image textures which face: a labelling with few seams.
 //!
 //! ```text
-//!   per view and face: visible? angle < 75°?  quality = Σ gradient over its pixels, mean colour      rate
-//!   per face: colours that disagree with the other views (an occluder, a highlight) are dropped      select
-//!   quality spread over neighbouring faces ──► first labels ──► Potts energy lowered ──► crumbs merged
+//!   per face: colours that disagree with the other views (an occluder, a highlight) are rejected
+//!   quality spread over neighbouring faces ──► first labels ──► Potts energy lowered ──► small patches merged
 //! ```
 //!
-//! After Waechter, Moehrle and Goesele, ECCV 2014; their solver is replaced by iterated conditional modes from a smoothed start.
+//! After Waechter, Moehrle and Goesele, ECCV 2014; their solver is replaced by iterated conditional modes from a smoothed start. All of
+//! it works on the faces' short lists of views ([`crate::candidates`]); spreading takes one view at a time.
 
+use crate::candidates::Candidates;
 use crate::error::{Result, require};
-use crate::mesh::{Mesh, NOTHING, components, neighbours, project};
-use crate::raster::Raster;
+use crate::mesh::{Mesh, NOTHING, components, neighbours};
 use rayon::prelude::*;
-
-/// One photograph with the mesh's z-buffer in it.
-#[derive(Debug, Clone, Copy)]
-pub struct Photo<'a> {
-    /// Interleaved RGB, (height, width · 3).
-    pub rgb: Raster<'a, u8>,
-    /// Gradient magnitude; negative where the photograph must not be used.
-    pub detail: Raster<'a, f32>,
-    /// The mesh's z-depth in this view.
-    pub depth: Raster<'a, f32>,
-    /// P = K [R | t], row-major.
-    pub projection: [f64; 12],
-    /// Camera centre.
-    pub center: [f64; 3],
-}
-
-/// What a photograph knows of a face.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Rating {
-    /// 0 where the face cannot be textured from this view.
-    pub quality: f32,
-    /// Mean colour.
-    pub colour: [u8; 3],
-}
-
-/// cos 75°: views that see a face flatter than this smear it.
-const LEAST_COSINE: f64 = 0.26;
-/// Grey levels of gradient that an even surface counts as having: resolution matters there too.
-const BASE_DETAIL: f32 = 4.0;
-
-/// Rates every face in a photograph; `tolerance` is the depth by which a vertex may lie behind the z-buffer.
-pub fn rate(mesh: Mesh, photo: &Photo, tolerance: f64) -> Result<Vec<Rating>> {
-    let (w, h) = (photo.depth.width, photo.depth.height);
-    require(photo.rgb.width == 3 * w && photo.rgb.height == h, "rgb", format!("{h} x {w} x 3"), "another size")?;
-    require(photo.detail.width == w && photo.detail.height == h, "detail", format!("{h} x {w}"), "another size")?;
-    Ok((0..mesh.faces.len()).into_par_iter().map(|f| rate_face(mesh, f, photo, tolerance)).collect())
-}
-
-fn rate_face(mesh: Mesh, face: usize, photo: &Photo, tolerance: f64) -> Rating {
-    let corners = mesh.corners(face);
-    let normal = mesh.normal(face);
-    let middle: [f64; 3] = std::array::from_fn(|k| (corners[0][k] + corners[1][k] + corners[2][k]) / 3.0);
-    let ray: [f64; 3] = std::array::from_fn(|k| photo.center[k] - middle[k]);
-    let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    let cosine = dot(normal, ray) / (dot(normal, normal) * dot(ray, ray)).sqrt().max(1e-300);
-    if cosine < LEAST_COSINE {
-        return Rating::default();
-    }
-    let (mut detail, mut colour) = (0.0, [0u32; 3]);
-    let points = [corners[0], corners[1], corners[2], middle].map(|p| project(&photo.projection, p));
-    for q in points {
-        let Some(at) = visible(photo, q, tolerance / cosine) else { return Rating::default() };
-        detail += photo.detail.data[at];
-        for k in 0..3 {
-            colour[k] += u32::from(photo.rgb.data[3 * at + k]);
-        }
-    }
-    let [a, b, c, _] = points;
-    let pixels = 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
-    Rating { quality: (detail / 4.0 + BASE_DETAIL) * pixels as f32, colour: colour.map(|c| (c / 4) as u8) }
-}
-
-/// Index of the pixel at which a projected point is seen, if it is.
-fn visible(photo: &Photo, [x, y, z]: [f64; 3], tolerance: f64) -> Option<usize> {
-    let (w, h) = (photo.depth.width, photo.depth.height);
-    if z <= 0.0 || !(x >= 1.0 && y >= 1.0 && x < w as f64 - 2.0 && y < h as f64 - 2.0) {
-        return None;
-    }
-    let at = (y + 0.5) as usize * w + (x + 0.5) as usize;
-    let surface = f64::from(photo.depth.data[at]);
-    (photo.detail.data[at] >= 0.0 && surface > 0.0 && z <= surface + tolerance).then_some(at)
-}
 
 /// How to label.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SelectParams {
     /// Cost of a seam along one edge, relative to the span of data costs (1).
     pub seam: f32,
-    /// Grey levels by which a view's colour may differ from the median of all views; 0 turns the check off.
+    /// Grey levels by which a view's colour may differ from the median of the list; 0 turns the check off.
     pub outlier: f32,
     /// Patches of fewer faces take a neighbouring patch's view where that one sees them.
     pub least_patch: usize,
@@ -98,55 +26,71 @@ pub struct SelectParams {
 
 /// Rounds of spreading quality before the first labels are taken.
 const SPREAD: usize = 8;
+/// Most rounds of iterated conditional modes.
 const SWEEPS: usize = 20;
+/// Most rounds of merging small patches.
+const MERGES: usize = 4;
+/// Faces that the scale of qualities is taken from.
+const SCALE_SAMPLE: usize = 200_000;
 
-/// A view a face, [`NOTHING`] for faces that no view sees; `ratings` holds one rating a face for each view.
-pub fn select_views(mesh: Mesh, ratings: &[Vec<Rating>], params: &SelectParams) -> Result<Vec<i32>> {
-    let (n, views) = (mesh.faces.len(), ratings.len());
-    require(ratings.iter().all(|r| r.len() == n), "ratings", format!("{n} values a view"), "another number")?;
+/// A view a face, [`NOTHING`] for faces that no view sees. Rejected views stay in their lists with quality 0.
+///
+/// `gains` are the factors a channel that bring each view's colours to common ones.
+pub fn select_views(mesh: Mesh, lists: &mut Candidates, gains: &[[f32; 3]], params: &SelectParams) -> Result<Vec<i32>> {
+    let n = mesh.faces.len();
+    require(lists.len() == n, "views", format!("lists of {n} faces"), lists.len())?;
+    lists.check(gains.len())?;
     let around = neighbours(mesh.faces);
-    let quality = usable(ratings, views, n, params.outlier);
-    let scale = 1.0 / percentile_95(&quality).max(1e-12);
-    let mut labels = start(&quality, &around, views);
+    if params.outlier > 0.0 {
+        reject_outliers(lists, gains, params.outlier);
+    }
+    let scale = 1.0 / percentile_95(lists).max(1e-12);
+    let mut labels = start(lists, &around, gains.len());
     for _ in 0..SWEEPS {
-        if !sweep(&quality, &around, views, scale, params.seam, &mut labels) {
+        if !sweep(lists, &around, scale, params.seam, &mut labels) {
             break;
         }
     }
-    for _ in 0..4 {
-        merge_crumbs(&quality, &around, views, params.least_patch, &mut labels);
+    for _ in 0..MERGES {
+        if !merge_small(lists, &around, params.least_patch, &mut labels) {
+            break;
+        }
     }
     Ok(labels)
 }
 
-/// Quality by face and view, 0 where a view is out of line with the colours of the others.
-fn usable(ratings: &[Vec<Rating>], views: usize, n: usize, outlier: f32) -> Vec<f32> {
-    let mut quality = vec![0.0; n * views];
-    quality.par_chunks_exact_mut(views.max(1)).enumerate().for_each(|(f, out)| {
-        let rating = |v: usize| &ratings[v][f];
-        for v in 0..views {
-            out[v] = rating(v).quality;
-        }
-        let seen: Vec<usize> = (0..views).filter(|&v| out[v] > 0.0).collect();
-        if outlier > 0.0 && seen.len() >= 3 {
+/// Sets the quality of views to 0 whose colour is out of line with the median of at least three.
+fn reject_outliers(lists: &mut Candidates, gains: &[[f32; 3]], outlier: f32) {
+    let slots = lists.slots;
+    let faces = lists.views.par_chunks_exact(slots).zip(lists.colours.par_chunks_exact(slots));
+    faces.zip(lists.qualities.par_chunks_exact_mut(slots)).for_each_init(
+        || (Vec::new(), Vec::new()),
+        |(seen, values), ((views, colours), qualities)| {
+            seen.clear();
+            seen.extend((0..slots).filter(|&s| qualities[s] > 0.0));
+            if seen.len() < 3 {
+                return;
+            }
+            let level = |s: usize, k: usize| f32::from(colours[s][k]) * gains[views[s] as usize][k];
             let median: [f32; 3] = std::array::from_fn(|k| {
-                let mut values: Vec<u8> = seen.iter().map(|&v| rating(v).colour[k]).collect();
-                values.sort_unstable();
-                f32::from(values[values.len() / 2])
+                values.clear();
+                values.extend(seen.iter().map(|&s| level(s, k)));
+                values.sort_unstable_by(f32::total_cmp);
+                values[values.len() / 2]
             });
-            for &v in &seen {
-                let far = (0..3).any(|k| (f32::from(rating(v).colour[k]) - median[k]).abs() > outlier);
-                if far {
-                    out[v] = 0.0;
+            for &s in seen.iter() {
+                if (0..3).any(|k| (level(s, k) - median[k]).abs() > outlier) {
+                    qualities[s] = 0.0;
                 }
             }
-        }
-    });
-    quality
+        },
+    );
 }
 
-fn percentile_95(quality: &[f32]) -> f32 {
-    let mut seen: Vec<f32> = quality.iter().copied().filter(|&q| q > 0.0).collect();
+/// The quality that 95 % of the views of a sample of the faces have at most.
+fn percentile_95(lists: &Candidates) -> f32 {
+    let faces = (0..lists.len()).step_by((lists.len() / SCALE_SAMPLE).max(1));
+    let mut seen: Vec<f32> = faces.flat_map(|f| &lists.qualities[lists.of(f)]).copied().filter(|&q| q > 0.0).collect();
     if seen.is_empty() {
         return 1.0;
     }
@@ -154,84 +98,102 @@ fn percentile_95(quality: &[f32]) -> f32 {
     *seen.select_nth_unstable_by(at, f32::total_cmp).1
 }
 
-/// Best view of each face by the quality of its surroundings: large patches from the outset.
-fn start(quality: &[f32], around: &[[i32; 3]], views: usize) -> Vec<i32> {
-    let (mut now, mut next) = (quality.to_vec(), vec![0.0; quality.len()]);
-    for _ in 0..SPREAD {
-        next.par_chunks_exact_mut(views.max(1)).enumerate().for_each(|(f, out)| {
-            out.copy_from_slice(&now[f * views..][..views]);
-            for &g in around[f].iter().filter(|&&g| g != NOTHING) {
-                for (o, q) in out.iter_mut().zip(&now[g as usize * views..][..views]) {
-                    *o += q;
-                }
+/// No entry.
+const NONE: u32 = u32::MAX;
+
+/// Best view of each face by the quality of its surroundings: large patches from the outset. Of equals the lowest number wins.
+fn start(lists: &Candidates, around: &[[i32; 3]], views: usize) -> Vec<i32> {
+    let n = lists.len();
+    let (mut labels, mut best) = (vec![NOTHING; n], vec![0.0f32; n]);
+    // Where a face stands among those that have the view.
+    let mut place = vec![NONE; n];
+    for view in 0..views as i32 {
+        let members: Vec<u32> =
+            (0..n as u32).into_par_iter().filter(|&f| lists.quality(f as usize, view) > 0.0).collect();
+        members.iter().zip(0..).for_each(|(&f, i)| place[f as usize] = i);
+        let spread = spread(lists, around, view, &members, &place);
+        for (&f, &quality) in members.iter().zip(&spread) {
+            let f = f as usize;
+            place[f] = NONE;
+            if labels[f] == NOTHING || quality > best[f] {
+                (labels[f], best[f]) = (view, quality);
             }
-            out.iter_mut().for_each(|o| *o *= 0.25);
+        }
+    }
+    labels
+}
+
+/// Mean quality of a view around each of its faces; 0 counts where a neighbour does not have the view.
+fn spread(lists: &Candidates, around: &[[i32; 3]], view: i32, members: &[u32], place: &[u32]) -> Vec<f32> {
+    let beside: Vec<[u32; 3]> = members
+        .par_iter()
+        .map(|&f| around[f as usize].map(|g| if g == NOTHING { NONE } else { place[g as usize] }))
+        .collect();
+    let mut now: Vec<f32> = members.par_iter().map(|&f| lists.quality(f as usize, view)).collect();
+    let mut next = vec![0.0; now.len()];
+    for _ in 0..SPREAD {
+        next.par_iter_mut().zip(&now).zip(&beside).for_each(|((out, &own), beside)| {
+            *out = 0.25 * beside.iter().filter(|&&g| g != NONE).fold(own, |sum, &g| sum + now[g as usize]);
         });
         std::mem::swap(&mut now, &mut next);
     }
-    (0..around.len())
-        .into_par_iter()
-        .map(|f| {
-            let own = &quality[f * views..][..views];
-            let spread = &now[f * views..][..views];
-            (0..views)
-                .filter(|&v| own[v] > 0.0)
-                .max_by(|&a, &b| spread[a].total_cmp(&spread[b]).then(b.cmp(&a)))
-                .map_or(NOTHING, |v| v as i32)
-        })
-        .collect()
+    now
 }
 
 /// One round of iterated conditional modes; whether a label changed.
-fn sweep(quality: &[f32], around: &[[i32; 3]], views: usize, scale: f32, seam: f32, labels: &mut [i32]) -> bool {
+fn sweep(lists: &Candidates, around: &[[i32; 3]], scale: f32, seam: f32, labels: &mut [i32]) -> bool {
     let mut changed = false;
     for f in 0..around.len() {
-        if labels[f] == NOTHING {
+        let now = labels[f];
+        let others = around[f].map(|g| if g == NOTHING { NOTHING } else { labels[g as usize] });
+        // Only a neighbour's view can be better than the present one.
+        if now == NOTHING || others.iter().all(|&v| v == NOTHING || v == now) {
             continue;
         }
-        let own = &quality[f * views..][..views];
-        let others = around[f].map(|g| if g == NOTHING { NOTHING } else { labels[g as usize] });
-        let cost = |v: i32| {
+        let cost = |v: i32, quality: f32| {
             let seams = others.iter().filter(|&&o| o != NOTHING && o != v).count() as f32;
-            1.0 - (own[v as usize] * scale).min(1.0) + seam * seams
+            1.0 - (quality * scale).min(1.0) + seam * seams
         };
-        let mut best = (labels[f], cost(labels[f]));
-        for v in others.into_iter().filter(|&v| v != NOTHING && own[v as usize] > 0.0) {
-            let c = cost(v);
-            if c < best.1 {
+        let mut best = (now, cost(now, lists.quality(f, now)));
+        for v in others.into_iter().filter(|&v| v != NOTHING && v != now) {
+            let quality = lists.quality(f, v);
+            let c = cost(v, quality);
+            if quality > 0.0 && c < best.1 {
                 best = (v, c);
             }
         }
-        changed |= best.0 != labels[f];
+        changed |= best.0 != now;
         labels[f] = best.0;
     }
     changed
 }
 
-/// Gives small patches to the neighbouring view that sees most of them.
-fn merge_crumbs(quality: &[f32], around: &[[i32; 3]], views: usize, least: usize, labels: &mut [i32]) {
+/// Gives small patches to the neighbouring view that sees most of them; whether a label changed.
+fn merge_small(lists: &Candidates, around: &[[i32; 3]], least: usize, labels: &mut [i32]) -> bool {
     let (part, count) = components(around, |f, g| labels[f] == labels[g]);
     let mut size = vec![0usize; count];
     for &p in &part {
         size[p as usize] += 1;
     }
+    let mut changed = false;
     for f in 0..around.len() {
         if size[part[f] as usize] >= least || labels[f] == NOTHING {
             continue;
         }
-        let own = &quality[f * views..][..views];
         let better = around[f]
             .iter()
             .filter(|&&g| g != NOTHING)
             .map(|&g| g as usize)
-            .filter(|&g| labels[g] != NOTHING && labels[g] != labels[f] && own[labels[g] as usize] > 0.0)
+            .filter(|&g| labels[g] != NOTHING && labels[g] != labels[f] && lists.quality(f, labels[g]) > 0.0)
             .max_by_key(|&g| (size[part[g] as usize], std::cmp::Reverse(g)));
         if let Some(g) = better
             && size[part[g] as usize] > size[part[f] as usize]
         {
             labels[f] = labels[g];
+            changed = true;
         }
     }
+    changed
 }
 
 #[cfg(test)]
@@ -247,8 +209,18 @@ mod tests {
 
     const PARAMS: SelectParams = SelectParams { seam: 0.5, outlier: 40.0, least_patch: 4 };
 
-    fn rating(quality: f32, grey: u8) -> Rating {
-        Rating { quality, colour: [grey; 3] }
+    /// Labels from the quality and grey level of each view of each face.
+    fn label(mesh: Mesh, count: usize, rating: impl Fn(usize, usize) -> (f32, u8), gains: &[[f32; 3]]) -> Vec<i32> {
+        let n = mesh.faces.len();
+        let (mut views, mut qualities, mut colours) =
+            (vec![-1i16; n * count], vec![0f32; n * count], vec![[0u8; 3]; n * count]);
+        let mut lists = Candidates::new(count, &mut views, &mut qualities, &mut colours).unwrap();
+        for v in 0..count {
+            let (quality, colour): (Vec<f32>, Vec<[u8; 3]>) =
+                (0..n).map(|f| rating(f, v)).map(|(q, grey)| (q, [grey; 3])).unzip();
+            lists.keep_best(v as i16, &quality, &colour).unwrap();
+        }
+        select_views(mesh, &mut lists, gains, &PARAMS).unwrap()
     }
 
     #[test]
@@ -257,10 +229,9 @@ mod tests {
         let mesh = Mesh::new(&vertices, &faces).unwrap();
         let noisy = |f: usize, v: usize| {
             let better = (f < 40) == (v == 0);
-            rating(if better { 1.0 } else { 0.8 } + if (f * 7 + v).is_multiple_of(5) { 0.3 } else { 0.0 }, 100)
+            (if better { 1.0 } else { 0.8 } + if (f * 7 + v).is_multiple_of(5) { 0.3 } else { 0.0 }, 100)
         };
-        let ratings: Vec<Vec<_>> = (0..2).map(|v| (0..80).map(|f| noisy(f, v)).collect()).collect();
-        let labels = select_views(mesh, &ratings, &PARAMS).unwrap();
+        let labels = label(mesh, 2, noisy, &[[1.0; 3]; 2]);
         let seams = labels.windows(2).filter(|p| p[0] != p[1]).count();
         assert_eq!(seams, 1, "{labels:?}");
         assert_eq!((labels[0], labels[79]), (0, 1));
@@ -270,32 +241,18 @@ mod tests {
     fn an_occluder_is_outvoted_and_unseen_faces_have_no_view() {
         let (vertices, faces) = strip(3);
         let mesh = Mesh::new(&vertices, &faces).unwrap();
-        let mut ratings: Vec<_> =
-            [(9.0, 250), (1.0, 100), (1.2, 104)].into_iter().map(|(q, grey)| vec![rating(q, grey); 6]).collect();
-        for view in &mut ratings {
-            view[5] = Rating::default();
-        }
-        let labels = select_views(mesh, &ratings, &PARAMS).unwrap();
-        assert_eq!(labels, [2, 2, 2, 2, 2, NOTHING]);
+        let rating = |f: usize, v: usize| if f == 5 { (0.0, 0) } else { [(9.0, 250), (1.0, 100), (1.2, 104)][v] };
+        assert_eq!(label(mesh, 3, rating, &[[1.0; 3]; 3]), [2, 2, 2, 2, 2, NOTHING]);
+        // The same levels are no outlier where that view is known to be brighter.
+        assert_eq!(label(mesh, 3, rating, &[[0.4; 3], [1.0; 3], [1.0; 3]]), [0, 0, 0, 0, 0, NOTHING]);
     }
 
     #[test]
-    fn a_face_seen_from_behind_or_hidden_is_rated_zero() {
-        let vertices = [[-1., -1., 4.], [1., -1., 4.], [0., 1., 4.]];
-        let (rgb, detail) = (vec![9u8; 40 * 40 * 3], vec![1.0f32; 1600]);
-        let rate_with = |depth: f32, faces: [[u32; 3]; 1]| {
-            let buffer = vec![depth; 1600];
-            let photo = Photo {
-                rgb: Raster::new(&rgb, 120, 40, "rgb").unwrap(),
-                detail: Raster::new(&detail, 40, 40, "detail").unwrap(),
-                depth: Raster::new(&buffer, 40, 40, "depth").unwrap(),
-                projection: [40., 0., 20., 0., 0., 40., 20., 0., 0., 0., 1., 0.],
-                center: [0.0; 3],
-            };
-            rate(Mesh::new(&vertices, &faces).unwrap(), &photo, 0.01).unwrap()[0].quality
-        };
-        assert!(rate_with(4.0, [[0, 2, 1]]) > 0.0);
-        assert_eq!(rate_with(4.0, [[0, 1, 2]]), 0.0);
-        assert_eq!(rate_with(3.0, [[0, 2, 1]]), 0.0);
+    fn lists_of_another_mesh_are_refused() {
+        let (vertices, faces) = strip(3);
+        let mesh = Mesh::new(&vertices, &faces).unwrap();
+        let (mut views, mut qualities, mut colours) = ([0i16; 5], [1f32; 5], [[0u8; 3]; 5]);
+        let mut lists = Candidates::new(1, &mut views, &mut qualities, &mut colours).unwrap();
+        assert!(select_views(mesh, &mut lists, &[[1.0; 3]], &PARAMS).is_err());
     }
 }
