@@ -12,6 +12,7 @@ from .. import _core
 from ..config import VolumeConfig
 from ..errors import ReconstructionError, require
 from ..geometry.cameras import Camera
+from ..geometry.rig import box_depth
 from ..silhouettes.occluder_repair import repaired_masks
 from ..types import Bounds, DepthMap, Report
 from .hull_prior import _open_share, hull_share, silhouette_distance
@@ -44,22 +45,30 @@ class Volume:
         return nx, ny, nz
 
 
+DEPTH_STEP = 4
+"""Pixels between the depths from which a view's scale and the voxel size are taken."""
+
+
+def _depths_inside(camera: Camera, view: DepthMap, bounds: Bounds) -> NDArray[np.float32]:
+    """Depths of a view, each `DEPTH_STEP` pixels, that lie inside the bounds."""
+    y, x = np.nonzero(view.depth[::DEPTH_STEP, ::DEPTH_STEP])
+    z = view.depth[::DEPTH_STEP, ::DEPTH_STEP][y, x]
+    points = camera.unproject(DEPTH_STEP * np.column_stack([x, y]), z)
+    return np.asarray(z[((points >= bounds[0]) & (points <= bounds[1])).all(1)])
+
+
 def target_voxel(cameras: Sequence[Camera], depths: Sequence[DepthMap], bounds: Bounds, config: VolumeConfig) -> float:
     """Voxel size in world units: ``config.footprints`` median pixel footprints (depth over focal length) inside the bounds."""
+    return _voxel(cameras, [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)], bounds, config)
+
+
+def _voxel(cameras: Sequence[Camera], inside: Sequence[NDArray[np.float32]], bounds: Bounds, config: VolumeConfig) -> float:
     if config.voxel is not None:
         require(config.voxel > 0, "voxel", "a positive size", config.voxel)
         return config.voxel
-    footprints = []
-    for camera, view in zip(cameras, depths, strict=True):
-        y, x = np.nonzero(view.depth[::4, ::4])
-        z = view.depth[::4, ::4][y, x]
-        points = camera.unproject(np.column_stack([4 * x, 4 * y]), z)
-        inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
-        footprints.append(z[inside] / camera.K[0, 0])
-    every = np.concatenate(footprints)
-    if not len(every):  # silhouettes alone: the box's middle stands for the target
-        middle = bounds.mean(0)[None]
-        every = np.array([c.to_camera(middle)[0, 2] / c.K[0, 0] for c in cameras])
+    every = np.concatenate([z / c.K[0, 0] for z, c in zip(inside, cameras, strict=True)])
+    if not len(every):  # silhouettes alone: the box stands for the target
+        every = np.array([box_depth(c, bounds) / c.K[0, 0] for c in cameras])
         every = every[every > 0]
     require(len(every), "bounds", "a box in front of the cameras", bounds.tolist())
     return config.footprints * float(np.median(every))
@@ -92,7 +101,9 @@ class _Fusion:
         found: Sequence[NDArray[np.uint8]] | None,
     ) -> _Fusion:
         bounds = np.asarray(bounds, np.float64)
-        outlines = found if masks is None else repaired_masks(depths, cameras, masks)
+        inside = [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)]
+        voxel = _voxel(cameras, inside, bounds, config)
+        outlines = found if masks is None else repaired_masks(depths, cameras, masks, voxel)
         silhouettes = None if outlines is None else [silhouette_distance(m) for m in outlines]
         solid_weight = 0.0
         if outlines is not None and silhouettes is not None:
@@ -102,7 +113,7 @@ class _Fusion:
             solid_weight = config.solid_share * trust**2 * open_share * len(depths)
         return cls(
             [d.depth for d in depths],
-            [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
+            [_weights(d, z) for d, z in zip(depths, inside, strict=True)],
             silhouettes,
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
             masks is None and found is not None,
@@ -110,7 +121,7 @@ class _Fusion:
             np.stack([c.projection for c in cameras]),
             bounds,
             config,
-            target_voxel(cameras, depths, bounds, config),
+            voxel,
         )
 
     def grid(self, voxel: float) -> Volume:
@@ -185,7 +196,7 @@ def fuse(
 
     Parameters
     ----------
-    depths : one a camera, of the camera's size; weights are confidence times (target distance / z)⁴, as σz grows with z².
+    depths : one a camera, of the camera's size; weights are confidence times (the view's median depth / z)⁴, as σz grows with z².
     bounds : (2, 3) world.
     masks : (h, w) uint8, non-zero on the target.
     windows : what each camera saw, of which its masks may be a part cut out; by default the masks' own size.
@@ -223,8 +234,8 @@ def fuse_tiles(
     """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out. Blocks deep
     inside the masks' hull are left out.
 
-    Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone: `mvcore.mesh.surface.isosurface`
-    joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
+    Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone:
+    `mvcore.mesh.surface.isosurface` joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
 
     found : silhouettes that were found in the photographs, instead of masks: their hull stands in where no depth map reaches, and cuts
         nothing.
@@ -251,10 +262,13 @@ def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
     report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
 
 
-def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
-    distance = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), 1e-9)
+def _weights(view: DepthMap, inside: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Confidence times (scale / z)⁴, as σz grows with z²; the scale is the view's median depth ``inside`` the bounds."""
+    if not len(inside):  # nothing of it is fused
+        return view.confidence
+    scale = np.float32(np.median(inside))
     # No depth is a distance of zero here: its weight is never asked for.
-    nearer = np.clip(np.float32(distance) / np.maximum(view.depth, np.float32(1e-6 * distance)), 0.1, 2.0)
+    nearer = np.clip(scale / np.maximum(view.depth, 1e-6 * scale), 0.1, 2.0)
     np.square(nearer, out=nearer)
     np.square(nearer, out=nearer)
     return np.multiply(nearer, view.confidence, out=nearer)

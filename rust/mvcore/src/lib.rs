@@ -11,6 +11,7 @@ pub mod carve;
 pub mod consistency;
 pub mod correlate;
 pub mod cube;
+pub mod distance_transform;
 pub mod error;
 pub mod expect;
 pub mod files;
