@@ -67,20 +67,26 @@ def pixels_of(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.i
 
 
 def _surface_cells(depths: Sequence[DepthMap], cameras: Sequence[Camera], cell: float) -> NDArray[np.float64]:
-    """A measured point (N, 3) of each cell that has any: as many as the surface is large, for any number of views."""
-    keys, points = [], []
+    """Mean of the measured points in each cell that has any, (N, 3): as many as the surface is large, for any number of views."""
+    keys, sums = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
     origin = np.mean([c.center for c in cameras], 0)
     for view, camera in zip(depths, cameras, strict=True):
         known = view.depth[view.depth > 0]
         # Two points along a cell's side.
         step = max(1, int(0.5 * cell * camera.K[0, 0] / float(np.median(known)))) if len(known) else 1
         y, x = np.nonzero(view.depth[::step, ::step])
-        cloud = camera.unproject(step * np.column_stack([x, y]), view.depth[::step, ::step][y, x])
-        key, first = np.unique(_keys((cloud - origin) / cell), return_index=True)
+        points = camera.unproject(step * np.column_stack([x, y]), view.depth[::step, ::step][y, x]) - origin
+        key, total = _summed(_keys(points / cell), np.column_stack([points, np.ones(len(points))]))
         keys.append(key)
-        points.append(cloud[first])
-    _, first = np.unique(np.concatenate(keys), return_index=True)
-    return np.asarray(np.concatenate(points)[first])
+        sums.append(total)
+    _, total = _summed(np.concatenate(keys), np.concatenate(sums))
+    return np.asarray(origin + total[:, :3] / total[:, 3:])
+
+
+def _summed(keys: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Distinct keys, and the sum of the rows of each."""
+    distinct, which = np.unique(keys, return_inverse=True)
+    return distinct, np.column_stack([np.bincount(which, r, len(distinct)) for r in rows.T])
 
 
 def _keys(places: NDArray[np.float64]) -> NDArray[np.int64]:
