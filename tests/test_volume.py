@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mvcore import _core
 from mvcore.config import CarveConfig, DepthConfig, VolumeConfig
+from mvcore.geometry.linear import solve, weighted_sum
 from mvcore.geometry.rig import box_depth, common_volume, surrounds
 from mvcore.mesh.surface import isosurface
 from mvcore.silhouettes.occluder_repair import repaired_masks
@@ -18,8 +21,9 @@ from mvcore.silhouettes.visual_hull import target_hull
 from mvcore.sparse.view_selection import choose_sources, depth_ranges, nearest_angles, target_box, view_middles, view_scores
 from mvcore.types import DepthMap, SparsePoints
 from mvcore.volume.hull_prior import silhouette_distance
-from mvcore.volume.photo_hull import photo_hull
-from mvcore.volume.tsdf import fuse
+from mvcore.volume.photo_hull import photo_hull, sparse_volume
+from mvcore.volume.tsdf import fuse, fuse_tiles
+from scipy.spatial import cKDTree
 
 SIDE = 3.0
 """Half the width of the room, whose walls lie at x, y = ±SIDE."""
@@ -128,8 +132,6 @@ def test_carving_takes_views_that_have_the_hull_behind_them(ring):
     two = target_hull([*outlines, outlines[0]], [*cameras, away], box, config)
     assert two.occupied.sum() == pytest.approx(one.occupied.sum(), rel=0.05)
     field = np.where(np.linalg.norm(np.indices((32,) * 3) / 31 - 0.5, axis=0) < 0.4, -1, 1).astype(np.float32)
-    from mvcore.volume.photo_hull import sparse_volume
-
     hull = sparse_volume(field, np.full(3, -0.6), 1.2 / 31)
     kept = [photo_hull(hull, [*images, images[0]][:n], [*cameras, away][:n]) for n in (12, 13)]
     assert np.array_equal(kept[0].values, kept[1].values)
@@ -187,8 +189,6 @@ def test_one_cut_mask_of_many_drills_no_hole(ring, width):
     box, config = np.array([[-0.7] * 3, [0.7] * 3]), VolumeConfig()
     whole, holed = (isosurface(fuse(maps, cameras, box, m, config)) for m in (cut, bad))
     voxel = 1.35 * 1.6 / 225
-    from scipy.spatial import cKDTree
-
     assert cKDTree(holed.vertices).query(whole.vertices)[0].max() < 2 * voxel
 
 
@@ -204,6 +204,42 @@ def test_masks_that_nothing_contradicts_stay_as_they_are(ring):
     repaired = repaired_masks(noisy, cameras, cut, 0.0096)
     # Points on the rim that the noise moved by two footprints and more: a few pixels at most.
     assert max(np.mean((r > 0) != (m > 0)) for r, m in zip(repaired, cut)) < 0.001
+
+
+class Read(Sequence):
+    """Items that are read when asked for; which ones were."""
+
+    def __init__(self, items):
+        self.items, self.asked = items, []
+
+    def __len__(self):
+        return len(self.items)
+
+    def __getitem__(self, n):
+        item = self.items[n]
+        self.asked.append(n)
+        return item
+
+
+def test_tiles_read_the_maps_of_the_views_that_see_them():
+    cameras = outward(8)
+    maps = [DepthMap(d, np.full(d.shape, 0.6, np.float32)) for d in map(room_depth, cameras)]
+    config = VolumeConfig(voxel=0.08)
+    bounds = ROOM + np.array([[-0.3], [0.3]])
+    whole = fuse(maps, cameras, bounds, None, config)
+    lazy = Read(maps)
+    values = {tuple(c): v for c, v in zip(whole.coords.tolist(), whole.values)}
+    asked, samples = [], 0
+    for tile in fuse_tiles(lazy, cameras, bounds, None, replace(config, max_memory=whole.values.nbytes // 4)):
+        asked.append(len(lazy.asked))
+        for c, block in zip(tile.coords.tolist(), tile.values):
+            known = np.isfinite(block)
+            assert np.array_equal(block[known], values[tuple(c)][known])
+            samples += known.sum()
+    assert samples >= np.isfinite(whole.values).sum()
+    # No tile of a quarter of the room lies before all cameras.
+    assert len(asked) >= 4
+    assert 0 < min(np.diff(asked)) < 8
 
 
 BYTES = """
@@ -257,3 +293,15 @@ def test_depth_and_fusion_give_the_same_bytes_at_any_address_and_for_any_threads
         return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
 
     assert len({digest(threads, seed) for threads, seed in ((1, 0), (2, 1), (4, 2))}) == 1
+
+
+@given(st.integers(1, 30), st.integers(0, 2**32 - 1))
+def test_systems_are_solved(n, seed):
+    rng = np.random.default_rng(seed)
+    matrix, right = rng.normal(size=(n, n)) + n * np.eye(n), rng.normal(size=(n, 2))
+    shuffled = rng.permutation(n)  # so that pivots lie off the diagonal
+    assert np.allclose(matrix[shuffled] @ solve(matrix[shuffled], right), right)
+    assert np.allclose(solve(matrix, right[:, 0]), solve(matrix, right)[:, 0])
+    assert np.allclose(weighted_sum(right, right[:, 0]), right.T @ right[:, 0])
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(np.zeros((n, n)), right)

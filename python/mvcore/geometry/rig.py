@@ -44,9 +44,14 @@ def surrounds(cameras: Sequence[Camera]) -> bool:
     return float(np.linalg.norm(np.mean([c.axis for c in cameras], 0))) < SURROUND
 
 
+def corners(box: Bounds) -> Float:
+    """The eight corners of a box, (8, 3)."""
+    return np.array(list(itertools.product(*np.asarray(box, np.float64).T)))
+
+
 def box_depth(camera: Camera, box: Bounds) -> float:
     """Middle of the z-depths at which a box lies in front of a camera: that of its centre where all of it does, 0 where none of it does."""
-    z = camera.to_camera(list(itertools.product(*np.asarray(box).T)))[:, 2]
+    z = camera.to_camera(corners(box))[:, 2]
     return 0.5 * (max(float(z.min()), 0.0) + max(float(z.max()), 0.0))
 
 

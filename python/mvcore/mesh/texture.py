@@ -13,6 +13,7 @@ from .. import _core
 from ..config import TextureConfig
 from ..errors import InvalidInputError, require
 from ..geometry.cameras import Camera
+from ..geometry.linear import solve
 from ..types import Image, Report, Track, no_track
 from .surface import Surface
 
@@ -87,7 +88,7 @@ def colour_gains(qualities: Sequence[NDArray[np.float32]], colours: Sequence[NDA
             matrix[j, i] -= weight
             vector[i] -= weight * ratio
             vector[j] += weight * ratio
-    gains = np.exp(np.linalg.solve(matrix, vector))
+    gains = np.exp(solve(matrix, vector))
     return np.clip(gains / np.exp(np.log(gains).mean(0)), 0.5, 2.0).astype(np.float32)
 
 

@@ -12,7 +12,7 @@ from ..config import DepthConfig
 from ..errors import ReconstructionError
 from ..geometry.cameras import Camera
 from ..geometry.epipolar import Float
-from ..geometry.rig import box_depth, common_volume, in_view, surrounds
+from ..geometry.rig import box_depth, common_volume, corners, in_view, surrounds
 from ..types import Bounds, SparsePoints
 
 LEAST_POINTS = 30
@@ -106,10 +106,9 @@ def depth_ranges(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, s
     The 1 % and 99 % depths of the points in view, stretched, and the box where points are few. With bounds given by the caller
     (``bounded``) the box alone.
     """
-    corners = np.array(list(itertools.product(*box.T)))
     ranges = []
     for c in cameras:
-        z_box = c.to_camera(corners)[:, 2]
+        z_box = c.to_camera(corners(box))[:, 2]
         far_box = max(float(z_box.max()), 1e-9)
         near_box = max(float(z_box.min()), 0.02 * far_box)
         # All points in the picture, also those matched elsewhere: far background is rarely matched in every view.

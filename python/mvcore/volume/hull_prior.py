@@ -36,7 +36,7 @@ HULL_POINTS = 2000
 """Points a view, about, by which that is judged."""
 
 
-def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.float32]]) -> float:
+def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]]) -> float:
     """Share of the measured surface that is the visual hull's, 1 where nothing was measured: much of a ball, little of a pickup's bed.
 
     What the hull says where nothing was measured is as trustworthy as that. Points count by their squared confidence: where little is
@@ -44,11 +44,11 @@ def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouette
 
     Parameters
     ----------
-    depths : filtered, one a camera. silhouettes : of `silhouette_distance`, one a camera.
+    depths : filtered, one a camera. masks : (h, w) uint8, non-zero on the target, one a camera.
     """
     clouds, weights = [], []
-    for view, camera, outside in zip(depths, cameras, silhouettes, strict=True):
-        y, x = np.nonzero((view.depth > 0) & (outside < 0))
+    for view, camera, mask in zip(depths, cameras, masks, strict=True):
+        y, x = np.nonzero((view.depth > 0) & (mask > 0))
         step = max(1, len(x) // HULL_POINTS)
         x, y = x[::step], y[::step]
         clouds.append(camera.unproject(np.column_stack([x, y]), view.depth[y, x]))
@@ -58,7 +58,8 @@ def hull_share(depths: Sequence[DepthMap], cameras: Sequence[Camera], silhouette
         return 1.0
     # A point lies as deep within the hull as within the outline to which it is nearest.
     depth_in_hull = np.full(len(points), -np.inf)
-    for camera, outside in zip(cameras, silhouettes, strict=True):
+    for camera, mask in zip(cameras, masks, strict=True):
+        outside = silhouette_distance(mask)
         seen, x, y = pixels_of(camera, points)
         z = camera.to_camera(points[seen])[:, 2]
         depth_in_hull[seen] = np.maximum(depth_in_hull[seen], outside[y, x] * z / camera.K[0, 0])

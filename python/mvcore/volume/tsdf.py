@@ -12,7 +12,7 @@ from .. import _core
 from ..config import VolumeConfig
 from ..errors import ReconstructionError, require
 from ..geometry.cameras import Camera
-from ..geometry.rig import box_depth
+from ..geometry.rig import box_depth, corners
 from ..silhouettes.occluder_repair import repaired_masks
 from ..types import Bounds, DepthMap, Report
 from .hull_prior import _open_share, hull_share, silhouette_distance
@@ -76,15 +76,15 @@ def _voxel(cameras: Sequence[Camera], inside: Sequence[NDArray[np.float32]], bou
 
 @dataclass(frozen=True)
 class _Fusion:
-    """What `_core.fuse` takes, checked and converted."""
+    """What the tiles of a fusion share: little beside the views' maps, which are read when a tile needs them."""
 
-    depths: list[NDArray[np.float32]]
-    weights: list[NDArray[np.float32]]
-    silhouettes: list[NDArray[np.float32]] | None
+    depths: Sequence[DepthMap]
+    cameras: Sequence[Camera]
+    scales: list[float]
+    outlines: Sequence[NDArray[np.uint8]] | None
     windows: list[Window]
     complete: bool
     solid_weight: float
-    projections: NDArray[np.float64]
     bounds: Bounds
     config: VolumeConfig
     voxel: float
@@ -104,21 +104,20 @@ class _Fusion:
         inside = [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)]
         voxel = _voxel(cameras, inside, bounds, config)
         outlines = found if masks is None else repaired_masks(depths, cameras, masks, voxel)
-        silhouettes = None if outlines is None else [silhouette_distance(m) for m in outlines]
         solid_weight = 0.0
-        if outlines is not None and silhouettes is not None:
+        if outlines is not None:
             open_share = _open_share(depths, outlines)
             # Little that was measured says little against the hull.
-            trust = 1 - (1 - open_share) * (1 - hull_share(depths, cameras, silhouettes))
+            trust = 1 - (1 - open_share) * (1 - hull_share(depths, cameras, outlines))
             solid_weight = config.solid_share * trust**2 * open_share * len(depths)
         return cls(
-            [d.depth for d in depths],
-            [_weights(d, z) for d, z in zip(depths, inside, strict=True)],
-            silhouettes,
+            depths,
+            cameras,
+            [float(np.median(z)) if len(z) else 0.0 for z in inside],
+            outlines,
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
             masks is None and found is not None,
             solid_weight,
-            np.stack([c.projection for c in cameras]),
             bounds,
             config,
             voxel,
@@ -136,21 +135,23 @@ class _Fusion:
         ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes.
         """
         config = self.config
+        blocks = np.array([[0, 0, 0], grid.blocks] if tile is None else tile)
+        depths, weights, silhouettes = self._maps(grid.origin + SIDE * grid.voxel * blocks)
         coords, values = _core.fuse(
             grid.origin.tolist(),
             grid.voxel,
             list(grid.shape),
-            self.depths,
-            self.weights,
-            self.silhouettes,
+            depths,
+            weights,
+            None if self.outlines is None else silhouettes,
             self.windows,
-            self.projections,
+            np.stack([c.projection for c in self.cameras]),
             tile=tile,
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
             solid_weight=self.solid_weight,
-            smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
+            smoothing=config.smoothing if self.outlines is None or self.complete else config.solid_smoothing,
             measured_smoothing=config.smoothing,
             hull_tolerance=config.hull_tolerance,
             complete=self.complete,
@@ -158,6 +159,21 @@ class _Fusion:
             max_memory=config.max_memory,
         )
         return replace(grid, coords=coords, values=values)
+
+    def _maps(self, box: Bounds) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]], list[NDArray[np.float32]]]:
+        """Depth, weights and silhouette's distance of each view that a box may be seen in; a pixel that says nothing of the others."""
+        depths, weights, silhouettes = [], [], []
+        for n, (camera, window) in enumerate(zip(self.cameras, self.windows, strict=True)):
+            if _may_see(camera, window, box):
+                view = self.depths[n]
+                depths.append(view.depth)
+                weights.append(_weights(view, self.scales[n]))
+                silhouettes.append(_NOTHING if self.outlines is None else silhouette_distance(self.outlines[n]))
+            else:
+                depths.append(_NOTHING)
+                weights.append(_NOTHING)
+                silhouettes.append(_NOTHING)
+        return depths, weights, silhouettes
 
     def tiles(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
         """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
@@ -237,6 +253,8 @@ def fuse_tiles(
     Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone:
     `mvcore.mesh.surface.isosurface` joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
 
+    depths, masks : any sequence; an item is asked for when a pass over all views or a tile needs it and is not kept, so that one which
+        reads from disk holds only the maps of the views that may see the tile.
     found : silhouettes that were found in the photographs, instead of masks: their hull stands in where no depth map reaches, and cuts
         nothing.
     """
@@ -262,13 +280,26 @@ def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
     report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
 
 
-def _weights(view: DepthMap, inside: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Confidence times (scale / z)⁴, as σz grows with z²; the scale is the view's median depth ``inside`` the bounds."""
-    if not len(inside):  # nothing of it is fused
+_NOTHING = np.zeros((1, 1), np.float32)
+"""What stands in for a map that no voxel asks."""
+
+
+def _may_see(camera: Camera, window: Window, box: Bounds) -> bool:
+    """Whether any of a box may fall on a camera's image or window; True where its corners do not tell."""
+    z = camera.to_camera(corners(box))[:, 2]
+    if z.min() <= 0:
+        return bool(z.max() > 0)
+    low, high = (f(camera.project(corners(box)), axis=0) for f in (np.min, np.max))
+    first, last = np.minimum(window[:2], 0) - 1, np.maximum(window[2:], (camera.width - 1, camera.height - 1)) + 1
+    return bool((low <= last).all() and (high >= first).all())
+
+
+def _weights(view: DepthMap, scale: float) -> NDArray[np.float32]:
+    """Confidence times (scale / z)⁴, as σz grows with z²; the scale is the view's median depth inside the bounds, 0 with none."""
+    if scale <= 0:  # nothing of it is fused
         return view.confidence
-    scale = np.float32(np.median(inside))
     # No depth is a distance of zero here: its weight is never asked for.
-    nearer = np.clip(scale / np.maximum(view.depth, 1e-6 * scale), 0.1, 2.0)
+    nearer = np.clip(np.float32(scale) / np.maximum(view.depth, np.float32(1e-6 * scale)), 0.1, 2.0)
     np.square(nearer, out=nearer)
     np.square(nearer, out=nearer)
     return np.multiply(nearer, view.confidence, out=nearer)
