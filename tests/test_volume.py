@@ -224,13 +224,13 @@ class Read(Sequence):
 def test_tiles_read_the_maps_of_the_views_that_see_them():
     cameras = outward(8)
     maps = [DepthMap(d, np.full(d.shape, 0.6, np.float32)) for d in map(room_depth, cameras)]
-    config = VolumeConfig(voxel=0.08)
+    config = VolumeConfig(voxel=0.05)
     bounds = ROOM + np.array([[-0.3], [0.3]])
     whole = fuse(maps, cameras, bounds, None, config)
     lazy = Read(maps)
     values = {tuple(c): v for c, v in zip(whole.coords.tolist(), whole.values)}
     asked, samples = [], 0
-    for tile in fuse_tiles(lazy, cameras, bounds, None, replace(config, max_memory=whole.values.nbytes // 4)):
+    for tile in fuse_tiles(lazy, cameras, bounds, None, replace(config, max_memory=whole.values.nbytes // 2)):
         asked.append(len(lazy.asked))
         for c, block in zip(tile.coords.tolist(), tile.values):
             known = np.isfinite(block)
