@@ -277,7 +277,7 @@ def plan(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, bounded: 
     """
     ranges = view_selection.depth_ranges(cameras, points, box, settings.range_stretch, bounded)
     sources = view_selection.choose_sources(view_selection.view_scores(cameras, points, box, settings.depth), settings.depth.sources)
-    nearest = _nearest_angles(cameras, box.mean(0))
+    nearest = view_selection.nearest_angles(cameras, view_selection.view_middles(cameras, points, box))
     surface = "depth maps in the visual hull" if masked else "depth maps"
     warnings = []
     if masked and np.median(nearest) > settings.stereo_angle:
@@ -297,15 +297,6 @@ def plan(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, bounded: 
             warnings.append(f"view {n} ({name}) is left out: no other view sees its surface from a near enough angle")
     figures = {"left_out": alone, "surface": surface, "nearest_view_degrees": [round(a, 1) for a in nearest]}
     return Plan(box, ranges, sources, Findings(figures, warnings))
-
-
-def _nearest_angles(cameras: Sequence[Camera], middle: NDArray[np.float64]) -> list[float]:
-    """Degrees at the target between each view and its nearest neighbour."""
-    to = np.array([middle - c.center for c in cameras])
-    to /= np.linalg.norm(to, axis=1, keepdims=True).clip(1e-300)
-    angles = np.degrees(np.arccos(np.clip(to @ to.T, -1, 1)))
-    np.fill_diagonal(angles, np.inf)
-    return [float(a) for a in angles.min(1)]
 
 
 # ---- depth ------------------------------------------------------------------------------------------------------------
