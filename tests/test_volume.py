@@ -227,7 +227,8 @@ def test_tiles_read_the_maps_of_the_views_that_see_them():
     config = VolumeConfig(voxel=0.05)
     bounds = ROOM + np.array([[-0.3], [0.3]])
     whole = fuse(maps, cameras, bounds, None, config)
-    lazy = Read(maps)
+    lazy = Read([*maps, None])
+    cameras.append(cameras[0])
     values = {tuple(c): v for c, v in zip(whole.coords.tolist(), whole.values)}
     asked, samples = [], 0
     for tile in fuse_tiles(lazy, cameras, bounds, None, replace(config, max_memory=whole.values.nbytes // 2)):

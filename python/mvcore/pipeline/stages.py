@@ -453,9 +453,8 @@ def _field(
     """The signed distance field of filtered depth maps, in parts; of the visual hull where there is no stereo."""
     masks = list(_Masks(pixels)) if rig.masked else None
     if rig.stereo:
-        known = [d if d is not None else _no_depth(c) for d, c in zip(depths, rig.cameras, strict=True)]
         outlines = None if completion is None else completion.silhouettes
-        yield from fuse_tiles(known, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines)
+        yield from fuse_tiles(depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines)
     elif settings.carve.photo_consistency:
         assert masks is not None
         hull = visual_hull(masks, rig.cameras, rig.box, settings.volume, report, rig.windows)
@@ -463,11 +462,6 @@ def _field(
     else:
         nothing, coarse = hull_alone(rig.cameras, settings.volume)
         yield from fuse_tiles(nothing, rig.cameras, rig.box, masks, coarse, report, rig.windows, None)
-
-
-def _no_depth(camera: Camera) -> DepthMap:
-    empty = np.zeros((camera.height, camera.width), np.float32)
-    return DepthMap(empty, empty)
 
 
 def _isosurface(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,24 @@ def _voxel(cameras: Sequence[Camera], inside: Sequence[NDArray[np.float32]], bou
     return config.footprints * float(np.median(every))
 
 
+class _Known(Sequence[DepthMap]):
+    """Depth maps, without depth where there is none; an item is asked for when it is indexed."""
+
+    def __init__(self, depths: Sequence[DepthMap | None], cameras: Sequence[Camera]) -> None:
+        require(len(depths) == len(cameras), "depths", f"{len(cameras)}, one a camera", len(depths))
+        self._depths, self._cameras = depths, cameras
+
+    def __len__(self) -> int:
+        return len(self._depths)
+
+    def __getitem__(self, n: Any) -> Any:
+        view, camera = self._depths[n], self._cameras[n]
+        if view is not None:
+            return view
+        empty = np.zeros((camera.height, camera.width), np.float32)
+        return DepthMap(empty, empty)
+
+
 @dataclass(frozen=True)
 class _Fusion:
     """What the tiles of a fusion share: little beside the views' maps, which are read when a tile needs them."""
@@ -92,7 +111,7 @@ class _Fusion:
     @classmethod
     def of(
         cls,
-        depths: Sequence[DepthMap],
+        maps: Sequence[DepthMap | None],
         cameras: Sequence[Camera],
         bounds: Bounds,
         masks: Sequence[NDArray[np.uint8]] | None,
@@ -100,7 +119,7 @@ class _Fusion:
         windows: Sequence[Window] | None,
         found: Sequence[NDArray[np.uint8]] | None,
     ) -> _Fusion:
-        bounds = np.asarray(bounds, np.float64)
+        bounds, depths = np.asarray(bounds, np.float64), _Known(maps, cameras)
         inside = [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)]
         voxel = _voxel(cameras, inside, bounds, config)
         outlines = found if masks is None else repaired_masks(depths, cameras, masks, voxel)
@@ -198,7 +217,7 @@ class _Fusion:
 
 
 def fuse(
-    depths: Sequence[DepthMap],
+    depths: Sequence[DepthMap | None],
     cameras: Sequence[Camera],
     bounds: Bounds,
     masks: Sequence[NDArray[np.uint8]] | None = None,
@@ -212,7 +231,8 @@ def fuse(
 
     Parameters
     ----------
-    depths : one a camera, of the camera's size; weights are confidence times (the view's median depth / z)⁴, as σz grows with z².
+    depths : one a camera, of the camera's size, or None where it has none; weights are
+        confidence times (the view's median depth / z)⁴, as σz grows with z².
     bounds : (2, 3) world.
     masks : (h, w) uint8, non-zero on the target.
     windows : what each camera saw, of which its masks may be a part cut out; by default the masks' own size.
@@ -238,7 +258,7 @@ def fuse(
 
 
 def fuse_tiles(
-    depths: Sequence[DepthMap],
+    depths: Sequence[DepthMap | None],
     cameras: Sequence[Camera],
     bounds: Bounds,
     masks: Sequence[NDArray[np.uint8]] | None = None,
