@@ -334,7 +334,7 @@ def test_an_occluder_in_a_mask_is_found_by_the_other_views_depth(ring, post):
     if post:  # A sign on a post: the slit is open at the lower end.
         cut[0][y:, x - post : x + post + 1] = 0
     maps[0] = DepthMap(np.where(cut[0] > 0, maps[0].depth, 0).astype(np.float32), maps[0].confidence)
-    repaired = repaired_masks(maps, cameras, cut)
+    repaired = repaired_masks(maps, cameras, cut, 1.35 * 1.6 / 225)
     lost = (whole > 0) & (cut[0] == 0)
     assert (repaired[0] > 0)[lost].mean() > 0.9
     below = lost[y + half + 2 :]
@@ -516,20 +516,19 @@ def test_disparities_have_their_edges_where_the_picture_has_them(monkeypatch):
 def test_a_ball_fills_its_hull_and_a_dented_one_does_not(ring):
     cameras, _, depths, masks = ring
     outlines = [m.astype(np.uint8) for m in masks]
-    outside = [silhouette_distance(m) for m in outlines]
     ball = [DepthMap(d.astype(np.float32), m.astype(np.float32)) for d, m in zip(depths, masks)]
-    assert hull_share(ball, cameras, outside) > 0.95
+    assert hull_share(ball, cameras, outlines) > 0.95
     # Every view sees a deep dent in the middle of its picture.
     inner = [cv2.erode(m, np.ones((25, 25), np.uint8)) > 0 for m in outlines]
     dented = [DepthMap(np.where(i, d + 0.2, d).astype(np.float32), m.astype(np.float32)) for d, m, i in zip(depths, masks, inner)]
     share = np.mean([i.sum() / m.sum() for i, m in zip(inner, masks)])
     # Near the ball's outline in another view a dent may meet the hull again.
-    assert hull_share(dented, cameras, outside) == pytest.approx(1 - share, abs=0.1)
+    assert hull_share(dented, cameras, outlines) == pytest.approx(1 - share, abs=0.1)
     # What is hardly believed hardly counts.
     doubted = [DepthMap(v.depth, np.where(i, 0.1, v.confidence).astype(np.float32)) for v, i in zip(dented, inner)]
-    assert hull_share(doubted, cameras, outside) > 0.9
+    assert hull_share(doubted, cameras, outlines) > 0.9
     nothing = [DepthMap(np.zeros_like(v.depth), np.zeros_like(v.depth)) for v in ball]
-    assert hull_share(nothing, cameras, outside) == 1
+    assert hull_share(nothing, cameras, outlines) == 1
     # With the same pixels unmeasured the dented one is dug out at less weight.
     open_rows = [np.where(np.arange(180)[:, None] < 80, 0, 1).astype(np.float32)] * len(cameras)
     box = np.array([[-0.7] * 3, [0.7] * 3])

@@ -14,6 +14,7 @@ __all__ = [
     "components",
     "consistency",
     "correlate",
+    "distance_transform",
     "encode_png",
     "expect",
     "fuse",
@@ -85,6 +86,7 @@ def consistency(
     pixel_unit: float,
     depth_unit: float,
 ) -> tuple[_F32, _U8]: ...
+def distance_transform(sites: _U8) -> tuple[_U32, _U32]: ...
 def fuse(
     origin: Sequence[float],
     voxel: float,

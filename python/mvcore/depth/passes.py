@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..config import DepthConfig
 from ..errors import require
 from ..geometry.cameras import Camera
@@ -125,11 +126,9 @@ def seeded_depth(
 
 
 def _filled(depth: Map) -> Map:
-    """The nearest known depth where none is."""
-    _, label = cv2.distanceTransformWithLabels((depth <= 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    known = np.zeros(int(label.max()) + 1, np.float32)
-    known[label[depth > 0]] = depth[depth > 0]
-    return known[label]
+    """The nearest known depth where none is; some must be known."""
+    _, nearest = _core.distance_transform((depth > 0).astype(np.uint8))
+    return depth.ravel()[nearest]
 
 
 NETWORK_SIDE = 576

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..config import MATCHERS, DepthConfig
 from ..errors import require
 from .occlusion import continued
@@ -81,7 +82,7 @@ def _confidence(d: Map, seen: NDArray[np.bool_], expected: Expected | None) -> M
     """
     around = np.ones((3, 3), np.uint8)
     jump = cv2.dilate(d, around) - cv2.erode(d, around) > JUMP
-    from_edge, from_seen = (cv2.distanceTransform(np.uint8(~m), cv2.DIST_L2, 3) for m in (jump, seen))
+    from_edge, from_seen = (np.sqrt(_core.distance_transform(m.astype(np.uint8))[0], dtype=np.float32) for m in (jump, seen))
     alone = np.where(seen, 1, UNSEEN / (1 + from_seen / ALONE))
     confidence = alone * (1 - np.exp(-(from_edge + 1) / EDGE))
     if expected is not None:

@@ -13,6 +13,7 @@ from .. import _core
 from ..errors import require
 from ..types import DepthMap
 from .cameras import Camera
+from .linear import solve, weighted_sum
 
 Float = NDArray[np.float64]
 
@@ -114,7 +115,7 @@ def align(moving: Cloud, fixed: Cloud, start: Float, size: float, rounds: int = 
         # About the middle of the target, where rotation and translation are least tangled.
         shifted = [Cloud(c.points - center, c.normals) for c in (at, fixed)]
         residual, gradient = _rows(*shifted, i, j)
-        step = _solve(gradient.T @ (weight[:, None] * gradient), -(gradient.T @ (weight * residual)))
+        step = _solve(gradient.T @ (weight[:, None] * gradient), -weighted_sum(gradient, weight * residual))
         shift = np.eye(4)
         shift[:3, 3] = center
         pose = shift @ _pose(step) @ np.linalg.inv(shift) @ pose
@@ -124,7 +125,7 @@ def align(moving: Cloud, fixed: Cloud, start: Float, size: float, rounds: int = 
 def _solve(matrix: Float, vector: Float) -> Float:
     """Damped: a direction that the surfaces do not fix (a wheel's axis, a plane's) stays where it is."""
     damping = 1e-6 * np.trace(matrix) / len(matrix)
-    return np.linalg.solve(matrix + damping * np.eye(len(matrix)), vector)
+    return solve(matrix + damping * np.eye(len(matrix)), vector)
 
 
 def find_poses(clouds: Sequence[Cloud], size: float, rounds: int = 40) -> tuple[Float, Float]:
@@ -176,7 +177,7 @@ def _refined(clouds: Sequence[Cloud], poses: Float, size: float, rounds: int) ->
                 residual, gradient = _rows(at[a], at[b], i, j)
                 weighted = weight[:, None] * gradient
                 sa, sb = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-                square, pull = gradient.T @ weighted, weighted.T @ residual
+                square, pull = gradient.T @ weighted, weighted_sum(weighted, residual)
                 # The plane moves with b; to first order by the same lever.
                 matrix[sa, sa] += square
                 matrix[sb, sb] += square

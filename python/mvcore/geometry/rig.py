@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from .cameras import Camera
 from .epipolar import Float
 
 SURROUND = 0.8
-"""Length of the mean viewing direction below which cameras look at a target from around it (about 75 degrees to either side)."""
+"""Length of the mean viewing direction below which cameras look in many directions (about 75 degrees to either side)."""
 
 
 COMMON = 0.6
@@ -39,8 +40,19 @@ def in_view(camera: Camera, points: Float) -> NDArray[np.bool_]:
 
 
 def surrounds(cameras: Sequence[Camera]) -> bool:
-    """Whether the cameras stand around the target rather than on one side of it."""
+    """Whether the cameras look in many directions: inwards from around a target, or outwards from amid what they see."""
     return float(np.linalg.norm(np.mean([c.axis for c in cameras], 0))) < SURROUND
+
+
+def corners(box: Bounds) -> Float:
+    """The eight corners of a box, (8, 3)."""
+    return np.array(list(itertools.product(*np.asarray(box, np.float64).T)))
+
+
+def box_depth(camera: Camera, box: Bounds) -> float:
+    """Middle of the z-depths at which a box lies in front of a camera: that of its centre where all of it does, 0 where none of it does."""
+    z = camera.to_camera(corners(box))[:, 2]
+    return 0.5 * (max(float(z.min()), 0.0) + max(float(z.max()), 0.0))
 
 
 def common_volume(cameras: Sequence[Camera], samples: int = 64) -> Bounds | None:

@@ -14,6 +14,7 @@ from .. import _core
 from ..config import TextureConfig
 from ..errors import require
 from ..geometry.cameras import Camera
+from ..geometry.linear import solve
 from ..types import Image, Track, no_track
 from .surface import Surface
 
@@ -109,7 +110,7 @@ def colour_gains(candidates: Candidates, count: int) -> NDArray[np.float32]:
     pull = weight[:, None] * ratios[enough]
     np.add.at(vector, first, -pull)
     np.add.at(vector, second, pull)
-    logs = np.linalg.solve(matrix, vector)
+    logs = solve(matrix, vector)
     return np.exp(logs - logs.mean(0)).clip(0.5, 2.0).astype(np.float32)
 
 

@@ -280,7 +280,7 @@ def plan(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, bounded: 
     """
     ranges = view_selection.depth_ranges(cameras, points, box, settings.range_stretch, bounded)
     sources = view_selection.choose_sources(view_selection.view_scores(cameras, points, box, settings.depth), settings.depth.sources)
-    nearest = _nearest_angles(cameras, box.mean(0))
+    nearest = view_selection.nearest_angles(cameras, view_selection.view_middles(cameras, points, box))
     surface = "depth maps in the visual hull" if masked else "depth maps"
     warnings = []
     if masked and np.median(nearest) > settings.stereo_angle:
@@ -300,15 +300,6 @@ def plan(cameras: Sequence[Camera], points: SparsePoints, box: Bounds, bounded: 
             warnings.append(f"view {n} ({name}) is left out: no other view sees its surface from a near enough angle")
     figures = {"left_out": alone, "surface": surface, "nearest_view_degrees": [round(a, 1) for a in nearest]}
     return Plan(box, ranges, sources, Findings(figures, warnings))
-
-
-def _nearest_angles(cameras: Sequence[Camera], middle: NDArray[np.float64]) -> list[float]:
-    """Degrees at the target between each view and its nearest neighbour."""
-    to = np.array([middle - c.center for c in cameras])
-    to /= np.linalg.norm(to, axis=1, keepdims=True).clip(1e-300)
-    angles = np.degrees(np.arccos(np.clip(to @ to.T, -1, 1)))
-    np.fill_diagonal(angles, np.inf)
-    return [float(a) for a in angles.min(1)]
 
 
 # ---- depth ------------------------------------------------------------------------------------------------------------
@@ -465,9 +456,8 @@ def _field(
     """The signed distance field of filtered depth maps, in parts; of the visual hull where there is no stereo."""
     masks = list(_Masks(pixels)) if rig.masked else None
     if rig.stereo:
-        known = [d if d is not None else _no_depth(c) for d, c in zip(depths, rig.cameras, strict=True)]
         outlines = None if completion is None else completion.silhouettes
-        yield from fuse_tiles(known, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines)
+        yield from fuse_tiles(depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines)
     elif settings.carve.photo_consistency:
         assert masks is not None
         hull = visual_hull(masks, rig.cameras, rig.box, settings.volume, report, rig.windows)
@@ -475,11 +465,6 @@ def _field(
     else:
         nothing, coarse = hull_alone(rig.cameras, settings.volume)
         yield from fuse_tiles(nothing, rig.cameras, rig.box, masks, coarse, report, rig.windows, None)
-
-
-def _no_depth(camera: Camera) -> DepthMap:
-    empty = np.zeros((camera.height, camera.width), np.float32)
-    return DepthMap(empty, empty)
 
 
 def _isosurface(

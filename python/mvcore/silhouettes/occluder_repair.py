@@ -1,4 +1,4 @@
-"""Silhouettes that an occluder cuts, repaired from the depth of the other views."""
+"""Silhouettes that an occluder or a mistake cuts, repaired from what the other views measured."""
 
 from __future__ import annotations
 
@@ -8,65 +8,110 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..geometry.cameras import Camera
 from ..types import DepthMap
 
-POINT_STEP = 2
-"""Pixels between the points that `repaired_masks` projects."""
+CELL = 3.0
+"""Voxels a side of the cells that votes are counted in: more than the noise of depth that views agree on."""
+LEAST_SUPPORT = 2
+"""Depth maps that must agree on a surface before it counts against a silhouette."""
 
 
-REACH = 9
-"""Pixels over which their density is measured, and gaps between them closed."""
+def repaired_masks(
+    depths: Sequence[DepthMap], cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]], voxel: float
+) -> list[NDArray[np.uint8]]:
+    """Masks filled where measured surface contradicts them: what stands before a target cuts its silhouette, and so does a bad mask.
 
-
-def repaired_masks(depths: Sequence[DepthMap], cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
-    """Masks with what other views' depth contradicts filled in: an occluder cuts a silhouette without cutting the target.
-
-    Surface points that the other views agree on and that fall densely outside a mask mean that something stands before them there.
-    Stray points along a silhouette are too thin to count; so is everything where no depth is known.
+    The measured surface votes cell by cell. Depth maps that show it speak for it; silhouettes that see it outside, and depth maps that
+    look through it, speak against it. Where more speak for it than against it, those silhouettes are wrong there. Depth that is wrong
+    lies outside most silhouettes and is seen through.
 
     Parameters
     ----------
-    depths : filtered depth maps of the target, one a camera. masks : (h, w) uint8, non-zero on the target.
+    depths : filtered depth maps of the target, one a camera. masks : (h, w) uint8, non-zero on the target. voxel : of the fusion, world
+        units.
+
+    Returns
+    -------
+    list
+        (h, w) uint8 of 0 and 1, one a camera.
     """
-    points = []
-    for view, camera in zip(depths, cameras, strict=True):
-        y, x = np.nonzero(view.depth[::POINT_STEP, ::POINT_STEP])
-        pixels = np.column_stack([x, y]) * POINT_STEP
-        points.append(camera.unproject(pixels, view.depth[pixels[:, 1], pixels[:, 0]]))
-    return [_repaired(m, c, [p for k, p in enumerate(points) if k != n]) for n, (m, c) in enumerate(zip(masks, cameras, strict=True))]
+    inside = [(m > 0).astype(np.uint8) for m in masks]
+    cell = CELL * voxel
+    points = _surface_cells(depths, cameras, cell)
+    votes = np.zeros((2, len(points)), np.int32)
+    outside = []
+    for camera, view, mask in zip(cameras, depths, inside, strict=True):
+        seen, x, y = pixels_of(camera, points)
+        z = camera.to_camera(points[seen])[:, 2]
+        beyond = view.depth[y, x] - z
+        known = view.depth[y, x] > 0
+        # A silhouette's border is as uncertain as measured points are.
+        away = _core.distance_transform(mask)[0][y, x] * np.square(z / camera.K[0, 0])
+        off = away > (0.5 * cell) ** 2
+        votes[0, seen] += known & (np.abs(beyond) <= cell)
+        votes[1, seen] += off | (known & (beyond > cell))
+        outside.append(seen[off])
+    wrong = (votes[0] >= LEAST_SUPPORT) & (votes[0] > votes[1])
+    return [_filled(mask, camera, points[n[wrong[n]]], cell) for mask, camera, n in zip(inside, cameras, outside, strict=True)]
 
 
-def _pixels(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Which points (N, 3) fall into the image, (N,) bool, and the columns and rows of their pixels, one an image point."""
+def pixels_of(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the points (N, 3) that fall into the image, and the columns and rows of their pixels."""
     nearest = np.rint(camera.project(points))
-    seen = ((nearest >= 0) & (nearest < (camera.width, camera.height))).all(1)
+    with np.errstate(invalid="ignore"):
+        seen = np.flatnonzero(((nearest >= 0) & (nearest < (camera.width, camera.height))).all(1))
     x, y = nearest[seen].astype(np.int64).T
     return seen, x, y
 
 
-def _repaired(mask: NDArray[np.uint8], camera: Camera, points: list[NDArray[np.float64]]) -> NDArray[np.uint8]:
-    inside = (mask > 0).astype(np.uint8)
-    hits = np.zeros(mask.shape, np.float32)
-    for cloud in points:
-        _, x, y = _pixels(camera, cloud)
-        # Each view counts once at a pixel.
-        seen = np.zeros(mask.shape, np.float32)
-        seen[y, x] = 1
-        hits += seen
-    # A surface that one view sees squarely has one point a step squared; more than one view must have seen it.
-    density = cv2.boxFilter(np.where(inside > 0, 0, hits).astype(np.float32), -1, (REACH, REACH)) * POINT_STEP**2
-    share = cv2.boxFilter(1.0 - inside.astype(np.float32), -1, (REACH, REACH))
-    doubted = ((density > 1.2 * share) & (inside == 0)).astype(np.uint8)
-    small, large = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (n, n)) for n in (REACH, 2 * REACH + 1))
-    solid = cv2.morphologyEx(cv2.morphologyEx(doubted, cv2.MORPH_CLOSE, small), cv2.MORPH_OPEN, large)
-    if not solid.any():
-        return inside
-    # What hangs on it in slits of the mask, with some of it on both sides, a post say; and the rim between it and the mask.
-    across = np.eye(2 * REACH + 1, dtype=np.uint8)
-    lines = (across, across[::-1].copy(), np.ones((1, len(across)), np.uint8), np.ones((len(across), 1), np.uint8))
-    slits = np.bitwise_or.reduce([cv2.morphologyEx(inside, cv2.MORPH_CLOSE, line) for line in lines]) & doubted
-    _, part = cv2.connectedComponents(solid | slits)
-    filled = inside | solid | (np.isin(part, np.unique(part[solid > 0])) & (slits > 0)).astype(np.uint8)
-    around = cv2.dilate(solid, small, iterations=2)
-    return filled | (cv2.morphologyEx(filled, cv2.MORPH_CLOSE, small) & around)
+def _surface_cells(depths: Sequence[DepthMap], cameras: Sequence[Camera], cell: float) -> NDArray[np.float64]:
+    """Mean of the measured points in each cell that has any, (N, 3): as many as the surface is large, for any number of views."""
+    keys, sums = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
+    origin = np.mean([c.center for c in cameras], 0)
+    for view, camera in zip(depths, cameras, strict=True):
+        known = view.depth[view.depth > 0]
+        # Two points along a cell's side.
+        step = max(1, int(0.5 * cell * camera.K[0, 0] / float(np.median(known)))) if len(known) else 1
+        y, x = np.nonzero(view.depth[::step, ::step])
+        points = camera.unproject(step * np.column_stack([x, y]), view.depth[::step, ::step][y, x]) - origin
+        key, total = _summed(_keys(points / cell), np.column_stack([points, np.ones(len(points))]))
+        keys.append(key)
+        sums.append(total)
+    _, total = _summed(np.concatenate(keys), np.concatenate(sums))
+    return np.asarray(origin + total[:, :3] / total[:, 3:])
+
+
+def _summed(keys: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Distinct keys, and the sum of the rows of each."""
+    distinct, which = np.unique(keys, return_inverse=True)
+    return distinct, np.column_stack([np.bincount(which, r, len(distinct)) for r in rows.T])
+
+
+def _keys(places: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Cells (N, 3) as single numbers: a million along each axis, of which those beyond share the last."""
+    most = 1 << 20
+    x, y, z = np.clip(np.floor(places), -most, most - 1).astype(np.int64).T + most
+    return np.asarray((x << 42) | (y << 21) | z)
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
+
+
+def _filled(mask: NDArray[np.uint8], camera: Camera, points: NDArray[np.float64], cell: float) -> NDArray[np.uint8]:
+    """The mask with points outside it, the gaps between these, and those to the mask."""
+    if not len(points):
+        return mask
+    marks = np.zeros_like(mask)
+    _, x, y = pixels_of(camera, points)
+    marks[y, x] = 1
+    disc = _disc(_reach(camera, points, cell))
+    joined = mask | marks
+    return np.asarray(joined | (cv2.morphologyEx(joined, cv2.MORPH_CLOSE, disc) & cv2.dilate(marks, disc)))
+
+
+def _reach(camera: Camera, points: NDArray[np.float64], cell: float) -> int:
+    """Pixels that a cell covers where points (N, 3) in view lie, the median of them, rounded up."""
+    return int(np.ceil(cell * camera.K[0, 0] / float(np.median(camera.to_camera(points)[:, 2]))))

@@ -13,6 +13,7 @@ from .. import _core
 from ..config import CarveConfig
 from ..errors import require
 from ..geometry.cameras import Camera
+from ..geometry.rig import box_depth
 from ..types import Bounds
 
 Mask = NDArray[np.uint8]
@@ -123,7 +124,7 @@ def splat(points: NDArray[np.float64], size: float, camera: Camera) -> Mask:
 
 def _grown(mask: Mask, camera: Camera, bounds: Bounds, voxel: float) -> Mask:
     """The mask wider by half a voxel's diagonal, so that a voxel counts where any part of it is inside."""
-    depth = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), voxel)
+    depth = max(box_depth(camera, bounds), voxel)
     reach = int(np.ceil(0.87 * voxel * camera.K[0, 0] / depth))
     return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1)))
 

@@ -13,6 +13,7 @@ from .. import _core
 from ..config import CarveConfig, VolumeConfig
 from ..errors import ReconstructionError
 from ..geometry.cameras import Camera
+from ..geometry.rig import box_depth
 from ..silhouettes.visual_hull import Mask
 from ..types import Bounds, DepthMap, Image, Report
 from .tsdf import SIDE, Volume, Window, fuse
@@ -67,8 +68,10 @@ def photo_hull(
     """
     config, report = config or CarveConfig(), report or Report()
     field = dense(hull, 1.0)
-    middle = hull.origin + 0.5 * hull.voxel * np.array(field.shape)
-    sides = [hull.voxel * c.K[0, 0] / max(float(c.to_camera(middle[None])[0, 2]), 1e-9) for c in cameras]
+    box = hull.origin + hull.voxel * np.array([[0, 0, 0], field.shape])
+    # A view that has the hull behind it sees no voxel: its footprint does not matter.
+    depths = [box_depth(c, box) for c in cameras]
+    sides = [hull.voxel * c.K[0, 0] / z if z > 0 else 1.0 for c, z in zip(cameras, depths, strict=True)]
     low, high = zip(*(_footprint(i, s) for i, s in zip(images, sides, strict=True)), strict=True)
     kept = _core.photo_carve(
         hull.origin.tolist(),

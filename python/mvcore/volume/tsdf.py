@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from .. import _core
 from ..config import VolumeConfig
 from ..errors import ReconstructionError, require
 from ..geometry.cameras import Camera
+from ..geometry.rig import box_depth, corners
 from ..silhouettes.occluder_repair import repaired_masks
 from ..types import Bounds, DepthMap, Report
 from .hull_prior import _open_share, hull_share, silhouette_distance
@@ -44,38 +46,64 @@ class Volume:
         return nx, ny, nz
 
 
+DEPTH_STEP = 4
+"""Pixels between the depths from which a view's scale and the voxel size are taken."""
+
+
+def _depths_inside(camera: Camera, view: DepthMap, bounds: Bounds) -> NDArray[np.float32]:
+    """Depths of a view, each `DEPTH_STEP` pixels, that lie inside the bounds."""
+    y, x = np.nonzero(view.depth[::DEPTH_STEP, ::DEPTH_STEP])
+    z = view.depth[::DEPTH_STEP, ::DEPTH_STEP][y, x]
+    points = camera.unproject(DEPTH_STEP * np.column_stack([x, y]), z)
+    return np.asarray(z[((points >= bounds[0]) & (points <= bounds[1])).all(1)])
+
+
 def target_voxel(cameras: Sequence[Camera], depths: Sequence[DepthMap], bounds: Bounds, config: VolumeConfig) -> float:
     """Voxel size in world units: ``config.footprints`` median pixel footprints (depth over focal length) inside the bounds."""
+    return _voxel(cameras, [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)], bounds, config)
+
+
+def _voxel(cameras: Sequence[Camera], inside: Sequence[NDArray[np.float32]], bounds: Bounds, config: VolumeConfig) -> float:
     if config.voxel is not None:
         require(config.voxel > 0, "voxel", "a positive size", config.voxel)
         return config.voxel
-    footprints = []
-    for camera, view in zip(cameras, depths, strict=True):
-        y, x = np.nonzero(view.depth[::4, ::4])
-        z = view.depth[::4, ::4][y, x]
-        points = camera.unproject(np.column_stack([4 * x, 4 * y]), z)
-        inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
-        footprints.append(z[inside] / camera.K[0, 0])
-    every = np.concatenate(footprints)
-    if not len(every):  # silhouettes alone: the box's middle stands for the target
-        middle = bounds.mean(0)[None]
-        every = np.array([c.to_camera(middle)[0, 2] / c.K[0, 0] for c in cameras])
+    every = np.concatenate([z / c.K[0, 0] for z, c in zip(inside, cameras, strict=True)])
+    if not len(every):  # silhouettes alone: the box stands for the target
+        every = np.array([box_depth(c, bounds) / c.K[0, 0] for c in cameras])
         every = every[every > 0]
     require(len(every), "bounds", "a box in front of the cameras", bounds.tolist())
     return config.footprints * float(np.median(every))
 
 
+class _Known(Sequence[DepthMap]):
+    """Depth maps, without depth where there is none; an item is asked for when it is indexed."""
+
+    def __init__(self, depths: Sequence[DepthMap | None], cameras: Sequence[Camera]) -> None:
+        require(len(depths) == len(cameras), "depths", f"{len(cameras)}, one a camera", len(depths))
+        self._depths, self._cameras = depths, cameras
+
+    def __len__(self) -> int:
+        return len(self._depths)
+
+    def __getitem__(self, n: Any) -> Any:
+        view, camera = self._depths[n], self._cameras[n]
+        if view is not None:
+            return view
+        empty = np.zeros((camera.height, camera.width), np.float32)
+        return DepthMap(empty, empty)
+
+
 @dataclass(frozen=True)
 class _Fusion:
-    """What `_core.fuse` takes, checked and converted."""
+    """What the tiles of a fusion share: little beside the views' maps, which are read when a tile needs them."""
 
-    depths: list[NDArray[np.float32]]
-    weights: list[NDArray[np.float32]]
-    silhouettes: list[NDArray[np.float32]] | None
+    depths: Sequence[DepthMap]
+    cameras: Sequence[Camera]
+    scales: list[float]
+    outlines: Sequence[NDArray[np.uint8]] | None
     windows: list[Window]
     complete: bool
     solid_weight: float
-    projections: NDArray[np.float64]
     bounds: Bounds
     config: VolumeConfig
     voxel: float
@@ -83,7 +111,7 @@ class _Fusion:
     @classmethod
     def of(
         cls,
-        depths: Sequence[DepthMap],
+        maps: Sequence[DepthMap | None],
         cameras: Sequence[Camera],
         bounds: Bounds,
         masks: Sequence[NDArray[np.uint8]] | None,
@@ -91,26 +119,27 @@ class _Fusion:
         windows: Sequence[Window] | None,
         found: Sequence[NDArray[np.uint8]] | None,
     ) -> _Fusion:
-        bounds = np.asarray(bounds, np.float64)
-        outlines = found if masks is None else repaired_masks(depths, cameras, masks)
-        silhouettes = None if outlines is None else [silhouette_distance(m) for m in outlines]
+        bounds, depths = np.asarray(bounds, np.float64), _Known(maps, cameras)
+        inside = [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)]
+        voxel = _voxel(cameras, inside, bounds, config)
+        outlines = found if masks is None else repaired_masks(depths, cameras, masks, voxel)
         solid_weight = 0.0
-        if outlines is not None and silhouettes is not None:
+        if outlines is not None:
             open_share = _open_share(depths, outlines)
             # Little that was measured says little against the hull.
-            trust = 1 - (1 - open_share) * (1 - hull_share(depths, cameras, silhouettes))
+            trust = 1 - (1 - open_share) * (1 - hull_share(depths, cameras, outlines))
             solid_weight = config.solid_share * trust**2 * open_share * len(depths)
         return cls(
-            [d.depth for d in depths],
-            [_weights(d, c, bounds) for d, c in zip(depths, cameras, strict=True)],
-            silhouettes,
+            depths,
+            cameras,
+            [float(np.median(z)) if len(z) else 0.0 for z in inside],
+            outlines,
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
             masks is None and found is not None,
             solid_weight,
-            np.stack([c.projection for c in cameras]),
             bounds,
             config,
-            target_voxel(cameras, depths, bounds, config),
+            voxel,
         )
 
     def grid(self, voxel: float) -> Volume:
@@ -125,21 +154,23 @@ class _Fusion:
         ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes.
         """
         config = self.config
+        blocks = np.array([[0, 0, 0], grid.blocks] if tile is None else tile)
+        depths, weights, silhouettes = self._maps(grid.origin + SIDE * grid.voxel * blocks)
         coords, values = _core.fuse(
             grid.origin.tolist(),
             grid.voxel,
             list(grid.shape),
-            self.depths,
-            self.weights,
-            self.silhouettes,
+            depths,
+            weights,
+            None if self.outlines is None else silhouettes,
             self.windows,
-            self.projections,
+            np.stack([c.projection for c in self.cameras]),
             tile=tile,
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
             solid_weight=self.solid_weight,
-            smoothing=config.smoothing if self.silhouettes is None or self.complete else config.solid_smoothing,
+            smoothing=config.smoothing if self.outlines is None or self.complete else config.solid_smoothing,
             measured_smoothing=config.smoothing,
             hull_tolerance=config.hull_tolerance,
             complete=self.complete,
@@ -147,6 +178,21 @@ class _Fusion:
             max_memory=config.max_memory,
         )
         return replace(grid, coords=coords, values=values)
+
+    def _maps(self, box: Bounds) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]], list[NDArray[np.float32]]]:
+        """Depth, weights and silhouette's distance of each view that a box may be seen in; a pixel that says nothing of the others."""
+        depths, weights, silhouettes = [], [], []
+        for n, (camera, window) in enumerate(zip(self.cameras, self.windows, strict=True)):
+            if _may_see(camera, window, box):
+                view = self.depths[n]
+                depths.append(view.depth)
+                weights.append(_weights(view, self.scales[n]))
+                silhouettes.append(_NOTHING if self.outlines is None else silhouette_distance(self.outlines[n]))
+            else:
+                depths.append(_NOTHING)
+                weights.append(_NOTHING)
+                silhouettes.append(_NOTHING)
+        return depths, weights, silhouettes
 
     def tiles(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
         """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
@@ -171,7 +217,7 @@ class _Fusion:
 
 
 def fuse(
-    depths: Sequence[DepthMap],
+    depths: Sequence[DepthMap | None],
     cameras: Sequence[Camera],
     bounds: Bounds,
     masks: Sequence[NDArray[np.uint8]] | None = None,
@@ -185,7 +231,8 @@ def fuse(
 
     Parameters
     ----------
-    depths : one a camera, of the camera's size; weights are confidence times (target distance / z)⁴, as σz grows with z².
+    depths : one a camera, of the camera's size, or None where it has none; weights are
+        confidence times (the view's median depth / z)⁴, as σz grows with z².
     bounds : (2, 3) world.
     masks : (h, w) uint8, non-zero on the target.
     windows : what each camera saw, of which its masks may be a part cut out; by default the masks' own size.
@@ -211,7 +258,7 @@ def fuse(
 
 
 def fuse_tiles(
-    depths: Sequence[DepthMap],
+    depths: Sequence[DepthMap | None],
     cameras: Sequence[Camera],
     bounds: Bounds,
     masks: Sequence[NDArray[np.uint8]] | None = None,
@@ -223,9 +270,11 @@ def fuse_tiles(
     """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out. Blocks deep
     inside the masks' hull are left out.
 
-    Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone: `mvcore.mesh.surface.isosurface`
-    joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
+    Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone:
+    `mvcore.mesh.surface.isosurface` joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
 
+    depths, masks : any sequence; an item is asked for when a pass over all views or a tile needs it and is not kept, so that one which
+        reads from disk holds only the maps of the views that may see the tile.
     found : silhouettes that were found in the photographs, instead of masks: their hull stands in where no depth map reaches, and cuts
         nothing.
     """
@@ -251,10 +300,26 @@ def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
     report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
 
 
-def _weights(view: DepthMap, camera: Camera, bounds: Bounds) -> NDArray[np.float32]:
-    distance = max(float(camera.to_camera(bounds.mean(0)[None])[0, 2]), 1e-9)
+_NOTHING = np.zeros((1, 1), np.float32)
+"""What stands in for a map that no voxel asks."""
+
+
+def _may_see(camera: Camera, window: Window, box: Bounds) -> bool:
+    """Whether any of a box may fall on a camera's image or window; True where its corners do not tell."""
+    z = camera.to_camera(corners(box))[:, 2]
+    if z.min() <= 0:
+        return bool(z.max() > 0)
+    low, high = (f(camera.project(corners(box)), axis=0) for f in (np.min, np.max))
+    first, last = np.minimum(window[:2], 0) - 1, np.maximum(window[2:], (camera.width - 1, camera.height - 1)) + 1
+    return bool((low <= last).all() and (high >= first).all())
+
+
+def _weights(view: DepthMap, scale: float) -> NDArray[np.float32]:
+    """Confidence times (scale / z)⁴, as σz grows with z²; the scale is the view's median depth inside the bounds, 0 with none."""
+    if scale <= 0:  # nothing of it is fused
+        return view.confidence
     # No depth is a distance of zero here: its weight is never asked for.
-    nearer = np.clip(np.float32(distance) / np.maximum(view.depth, np.float32(1e-6 * distance)), 0.1, 2.0)
+    nearer = np.clip(np.float32(scale) / np.maximum(view.depth, np.float32(1e-6 * scale)), 0.1, 2.0)
     np.square(nearer, out=nearer)
     np.square(nearer, out=nearer)
     return np.multiply(nearer, view.confidence, out=nearer)

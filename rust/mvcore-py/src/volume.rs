@@ -48,6 +48,18 @@ pub fn consistency<'py>(
     Ok((array(py, kept, shape)?, array(py, support, shape)?))
 }
 
+/// Squared distance of each pixel to the nearest site and that site's row-major index; u32::MAX where there is none.
+#[pyfunction]
+pub fn distance_transform<'py>(
+    py: Python<'py>,
+    sites: PyReadonlyArray2<'py, u8>,
+) -> PyResult<(Bound<'py, PyArray2<u32>>, Bound<'py, PyArray2<u32>>)> {
+    let sites = raster(&sites, "sites")?;
+    let found = run(py, || mvcore::distance_transform::distance_transform(sites))?;
+    let shape = [sites.height, sites.width];
+    Ok((array(py, found.squared, shape)?, array(py, found.nearest, shape)?))
+}
+
 #[pyfunction]
 #[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, measured_smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
 pub fn fuse<'py>(

@@ -6,8 +6,8 @@
 //!
 //! Voxels farther than τ in front of a surface get +τ from that view: free space carves what other views put there by mistake.
 //! With silhouettes the field is cut by the visual hull and what no depth map reaches inside the hull is solid; or they only
-//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Deep inside a hull
-//! that cuts, nothing is observed and no surface passes: blocks there may be left out. Curless and Levoy, SIGGRAPH 1996; blocks
+//! complete it: what was observed stays, elsewhere the hull's distance stands in, near the hull and within it. Of a hull that cuts, blocks
+//! amid others that are free throughout, or solid throughout, hold no surface and may be left out. Curless and Levoy, SIGGRAPH 1996; blocks
 //! after Nießner et al., SIGGRAPH Asia 2013. Each block is computed by one task from all views in order: the same bytes for any
 //! thread count.
 
@@ -65,7 +65,7 @@ pub struct FusionParams {
     pub hull_tolerance: f32,
     /// Silhouettes complete what the depth maps leave open; they cut nothing.
     pub complete: bool,
-    /// Blocks deep inside a hull that cuts are left out.
+    /// Blocks of a hull that cuts are left out where they and all around them are free, or solid, throughout.
     pub hollow: bool,
     /// Most bytes of the volume.
     pub max_memory: usize,
@@ -125,12 +125,13 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
         Hull::Cuts => restrict_to_hull(&grid, &tile, &silhouettes, params.hull_tolerance, &flags),
         Hull::Completes => mark_hull(&grid, &tile, &silhouettes, params.hull_tolerance, params.truncation, &flags),
     }
-    let tiles: Vec<Tiles> = views.par_iter().map(|v| Tiles::of(v.depth)).collect();
+    let tiles: Vec<Tiles> = views.par_iter().map(Tiles::of).collect();
     let mut flags: Vec<bool> = flags.into_iter().map(AtomicBool::into_inner).collect();
     let mut inside = vec![false; count];
     if hull == Hull::Cuts && params.hollow {
-        inside = deep_blocks(&grid, &tile, views, &tiles, &silhouettes, params, &flags);
-        flags = (0..count).into_par_iter().map(|n| flags[n] && !amid(&tile, n, &inside)).collect();
+        let contents = contents(&grid, &tile, views, &tiles, &silhouettes, params, &flags);
+        flags = (0..count).into_par_iter().map(|n| flags[n] && !amid(&tile, n, &contents)).collect();
+        inside = contents.iter().map(|&c| c == Content::Solid).collect();
     }
     let map = BlockMap::from_flags(tile, flags.into_iter());
     let needed = map.coords.len() * (BLOCK * VOXEL_BYTES + size_of::<Bits>()) + table;
@@ -179,8 +180,21 @@ enum Hull {
     Completes,
 }
 
-/// Of the flagged blocks, those that no depth map says anything of and that lie deep inside the hull: they are solid throughout.
-fn deep_blocks(
+/// What all of a block's voxels hold.
+#[derive(Clone, Copy, PartialEq)]
+enum Content {
+    /// 1: the hull leaves it out.
+    Outside,
+    /// 1: views enough to overrule the solid hull see through it, and none sees a surface in it.
+    Free,
+    /// -1: deep inside the hull, and what sees through it is too little to overrule that.
+    Solid,
+    /// Different values, or nobody knows without asking each voxel.
+    Mixed,
+}
+
+/// What each block of the tile holds, where silhouettes cut the field.
+fn contents(
     grid: &Grid,
     tile: &Tile,
     views: &[FusionView],
@@ -188,27 +202,49 @@ fn deep_blocks(
     silhouettes: &[SoftSilhouette],
     params: &FusionParams,
     flags: &[bool],
-) -> Vec<bool> {
-    let solid = |(n, &flag): (usize, &bool)| {
+) -> Vec<Content> {
+    let content = |(n, &flag): (usize, &bool)| {
+        if !flag {
+            return Content::Outside;
+        }
         let at = tile.block(n).map(|v| v as u32);
-        let unseen = |(view, tiles): (&FusionView, &Tiles)| {
-            Stepper::new(grid, at, &view.projection).misses(tiles, params.truncation as f32)
-        };
-        flag && views.iter().zip(tiles).all(unseen)
-            && deep_inside(grid, at, silhouettes, params.hull_tolerance, params.truncation)
+        let (mut least, mut most) = (0.0f32, 0.0f32);
+        for (view, tiles) in views.iter().zip(tiles) {
+            match Stepper::new(grid, at, &view.projection).says(tiles, params.truncation as f32) {
+                Says::Nothing => {}
+                Says::Free(weights) => {
+                    least += params.free_weight * weights[0];
+                    most += params.free_weight * weights[1];
+                }
+                Says::Surface => return Content::Mixed,
+            }
+        }
+        // Sums in another order differ in their last digits.
+        if most == 0.0 || most < params.solid_weight * 0.999 {
+            let deep = deep_inside(grid, at, silhouettes, params.hull_tolerance, params.truncation);
+            if deep { Content::Solid } else { Content::Mixed }
+        } else if least > params.solid_weight * 1.001 {
+            Content::Free
+        } else {
+            Content::Mixed
+        }
     };
-    flags.par_iter().enumerate().map(solid).collect()
+    flags.par_iter().enumerate().map(content).collect()
 }
 
-/// Whether a block and all 26 around it are solid: no cell of its own or of a neighbour's holds a surface, nor does smoothing reach one.
-fn amid(tile: &Tile, n: usize, solid: &[bool]) -> bool {
+/// Whether a block and all 26 around it hold the same: no cell of any holds a surface, nor does smoothing reach one.
+fn amid(tile: &Tile, n: usize, contents: &[Content]) -> bool {
+    let same = |content: Content| match contents[n] {
+        Content::Solid => content == Content::Solid,
+        Content::Free => matches!(content, Content::Free | Content::Outside),
+        Content::Outside | Content::Mixed => false,
+    };
     let at = tile.block(n);
-    solid[n]
-        && (0..27).all(|k| {
-            let step = [k / 9, k / 3 % 3, k % 3];
-            let near = [0, 1, 2].map(|a| (at[a] + step[a]).wrapping_sub(1));
-            tile.index(near).is_some_and(|m| solid[m])
-        })
+    (0..27).all(|k| {
+        let step = [k / 9, k / 3 % 3, k % 3];
+        let near = [0, 1, 2].map(|a| (at[a] + step[a]).wrapping_sub(1));
+        tile.index(near).is_some_and(|m| same(contents[m]))
+    })
 }
 
 /// Marks the blocks within τ of a view's surface, walking each pixel's ray.
@@ -276,8 +312,8 @@ impl Stepper {
         Self { base: std::array::from_fn(|r| row(r) as f32), di: column(0), dj: column(1), dk: column(2) }
     }
 
-    /// Whether the view says nothing of the block: it falls off the image, or lies more than τ behind all that is seen there.
-    fn misses(&self, tiles: &Tiles, truncation: f32) -> bool {
+    /// Least and greatest column, row and depth of the block's corners.
+    fn extent(&self) -> [[f32; 3]; 2] {
         let corner = |c: usize| -> [f32; 3] {
             let f = |bit: usize| if c >> bit & 1 == 1 { (SIDE - 1) as f32 } else { 0.0 };
             std::array::from_fn(|r| self.base[r] + f(0) * self.di[r] + f(1) * self.dj[r] + f(2) * self.dk[r])
@@ -291,52 +327,102 @@ impl Stepper {
                 high[a] = if p[a] <= high[a] { high[a] } else { p[a] };
             }
         }
+        [low, high]
+    }
+
+    /// What the view says of the block as a whole.
+    fn says(&self, tiles: &Tiles, truncation: f32) -> Says {
+        let [low, high] = self.extent();
         if high[2] <= 0.0 {
-            return true;
+            return Says::Nothing;
         }
         if low[2] <= 0.0 {
-            return false;
+            return Says::Surface;
         }
         let (width, height) = (tiles.width as f32, tiles.height as f32);
-        low[0] > width - 0.5
-            || high[0] < -0.5
-            || low[1] > height - 0.5
-            || high[1] < -0.5
-            || low[2] - truncation > tiles.deepest([low[0], low[1]], [high[0], high[1]])
+        if low[0] > width - 0.5 || high[0] < -0.5 || low[1] > height - 0.5 || high[1] < -0.5 {
+            return Says::Nothing;
+        }
+        let seen = tiles.under([low[0], low[1]], [high[0], high[1]]);
+        if low[2] - truncation > seen.depth[1] {
+            return Says::Nothing;
+        }
+        if high[2] + 1.01 * truncation >= seen.depth[0] {
+            return Says::Surface;
+        }
+        let whole = low[0] >= 0.0 && low[1] >= 0.0 && high[0] <= width - 1.0 && high[1] <= height - 1.0;
+        Says::Free([if whole { seen.weight[0] } else { 0.0 }, seen.weight[1]])
     }
 }
 
-/// The greatest depth of each tile of a depth map.
+/// What a view says of a block.
+enum Says {
+    /// It falls off the image, or lies more than τ behind all that is seen there.
+    Nothing,
+    /// It lies more than τ before all that is seen there; least and greatest weight of that.
+    Free([f32; 2]),
+    /// A surface may be near.
+    Surface,
+}
+
+/// Least and greatest depth, of the pixels that have any, and weight, 0 without depth, of a part of a depth map.
+#[derive(Clone, Copy)]
+struct Extremes {
+    depth: [f32; 2],
+    weight: [f32; 2],
+}
+
+impl Extremes {
+    const NONE: Self = Self { depth: [f32::INFINITY, 0.0], weight: [f32::INFINITY, 0.0] };
+
+    fn and(self, other: Self) -> Self {
+        let join = |a: [f32; 2], b: [f32; 2]| [a[0].min(b[0]), a[1].max(b[1])];
+        Self { depth: join(self.depth, other.depth), weight: join(self.weight, other.weight) }
+    }
+
+    fn of(depth: f32, weight: f32) -> Self {
+        if depth > 0.0 {
+            Self { depth: [depth; 2], weight: [weight; 2] }
+        } else {
+            Self { weight: [0.0; 2], ..Self::NONE }
+        }
+    }
+}
+
+/// The extremes of each tile of a depth map.
 struct Tiles {
     width: usize,
     height: usize,
     across: usize,
-    depth: Vec<f32>,
+    extremes: Vec<Extremes>,
 }
 
 /// Pixels along a tile's side.
 const TILE: usize = 16;
 
 impl Tiles {
-    fn of(depth: Raster<f32>) -> Self {
-        let (width, height) = (depth.width, depth.height);
+    fn of(view: &FusionView) -> Self {
+        let (width, height) = (view.depth.width, view.depth.height);
         let across = width.div_ceil(TILE);
-        let mut most = vec![0.0f32; across * height.div_ceil(TILE)];
+        let mut extremes = vec![Extremes::NONE; across * height.div_ceil(TILE)];
         for y in 0..height {
-            for (x, strip) in depth.row(y).chunks(TILE).enumerate() {
-                let m = &mut most[y / TILE * across + x];
-                *m = strip.iter().copied().fold(*m, f32::max);
+            let strips = view.depth.row(y).chunks(TILE).zip(view.weight.row(y).chunks(TILE));
+            for (x, (depth, weight)) in strips.enumerate() {
+                let of_strip = depth.iter().zip(weight).map(|(&d, &w)| Extremes::of(d, w));
+                let tile = &mut extremes[y / TILE * across + x];
+                *tile = of_strip.fold(*tile, Extremes::and);
             }
         }
-        Self { width, height, across, depth: most }
+        Self { width, height, across, extremes }
     }
 
-    /// The greatest depth among the tiles under a box of pixels, one pixel wider for interpolation.
-    fn deepest(&self, low: [f32; 2], high: [f32; 2]) -> f32 {
+    /// The extremes of the tiles under a box of pixels, one pixel wider for interpolation.
+    fn under(&self, low: [f32; 2], high: [f32; 2]) -> Extremes {
         let tile = |p: f32, size: usize| (p.max(0.0) as usize).min(size - 1) / TILE;
         let (x0, x1) = (tile(low[0] - 1.0, self.width), tile(high[0] + 1.5, self.width));
         let (y0, y1) = (tile(low[1] - 1.0, self.height), tile(high[1] + 1.5, self.height));
-        (y0..=y1).flat_map(|y| &self.depth[y * self.across + x0..=y * self.across + x1]).copied().fold(0.0, f32::max)
+        let rows = (y0..=y1).flat_map(|y| &self.extremes[y * self.across + x0..=y * self.across + x1]);
+        rows.copied().fold(Extremes::NONE, Extremes::and)
     }
 }
 
@@ -361,7 +447,7 @@ fn integrate(
     let mut near = [0.0f32; BLOCK];
     for (view, tiles) in views.iter().zip(tiles) {
         let stepper = Stepper::new(grid, at, &view.projection);
-        if stepper.misses(tiles, params.truncation as f32) {
+        if matches!(stepper.says(tiles, params.truncation as f32), Says::Nothing) {
             continue;
         }
         let rows = sum.as_chunks_mut::<SIDE>().0.iter_mut();
@@ -524,10 +610,10 @@ mod tests {
     }
 
     #[test]
-    fn a_hollow_hull_lacks_its_inside_and_nothing_else() {
-        // A slanted plane is seen through a wide silhouette: solid behind it.
+    fn a_hollow_hull_lacks_what_is_free_or_solid_throughout_and_nothing_else() {
+        // A slanted plane is seen through a wide silhouette: free before it, solid behind it.
         let depth: Vec<f32> =
-            (0..64 * 64).map(|i| if i % 64 < 40 { 3.4 + 0.004 * (i % 64) as f32 } else { 0.0 }).collect();
+            (0..64 * 64).map(|i| if i % 64 < 40 { 3.9 + 0.004 * (i % 64) as f32 } else { 0.0 }).collect();
         let weight = vec![1.0f32; 64 * 64];
         let outside: Vec<f32> =
             (0..64 * 64).map(|i| (((i % 64) as f32 - 31.5).hypot((i / 64) as f32 - 31.5)) - 28.0).collect();
@@ -536,17 +622,25 @@ mod tests {
         let full = FusionParams { truncation: 0.06, smoothing: 1.5, ..PARAMS };
         let whole = fuse(grid, &[view], &full).unwrap();
         let hollow = fuse(grid, &[view], &FusionParams { hollow: true, ..full }).unwrap();
-        assert!(hollow.map.coords.len() * 4 < whole.map.coords.len() * 3);
+        let (mut free, mut solid) = (0, 0);
         for (n, c) in whole.map.coords.iter().enumerate() {
             let block = &whole.values[n * BLOCK..][..BLOCK];
             match hollow.map.at(c[0] as usize, c[1] as usize, c[2] as usize) {
-                u32::MAX => assert!(block.iter().all(|&v| v == -1.0), "{c:?}"),
+                u32::MAX if block[0] > 0.0 => {
+                    free += 1;
+                    assert!(block.iter().all(|&v| v == 1.0), "{c:?}");
+                }
+                u32::MAX => {
+                    solid += 1;
+                    assert!(block.iter().all(|&v| v == -1.0), "{c:?}");
+                }
                 slot => {
                     let same = &hollow.values[slot as usize * BLOCK..][..BLOCK];
                     assert!(block.iter().zip(same).all(|(a, b)| a.to_bits() == b.to_bits()), "{c:?}");
                 }
             }
         }
+        assert!(free > 40 && solid > 40, "{free} {solid}");
     }
 
     #[test]

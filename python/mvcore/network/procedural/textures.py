@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ... import _core
+
 Random = np.random.Generator
 Tile = NDArray[np.uint8]
 SIDE = 256
@@ -95,10 +97,11 @@ def _checks(random: Random) -> Tile:
 
 def _voronoi(random: Random) -> Tile:
     seeds = random.integers(0, SIDE, (int(random.integers(20, 200)), 2))
-    marks = np.full((SIDE, SIDE), 255, np.uint8)
-    marks[seeds[:, 0], seeds[:, 1]] = 0
-    distance, label = cv2.distanceTransformWithLabels(marks, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    palette = random.integers(10, 246, (int(label.max()) + 1, 3))
+    marks = np.zeros((SIDE, SIDE), np.uint8)
+    marks[seeds[:, 0], seeds[:, 1]] = 1
+    squared, nearest = _core.distance_transform(marks)
+    distance, label = np.sqrt(squared), np.searchsorted(np.flatnonzero(marks), nearest)
+    palette = random.integers(10, 246, (int(marks.sum()), 3))
     return (palette[label] * (1 - 0.5 * (distance / distance.max())[..., None])).astype(np.uint8)
 
 
