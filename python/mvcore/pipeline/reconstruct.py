@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from ..config import Config
-from ..errors import require
+from ..errors import ReconstructionError, require
 from ..geometry.cameras import Calibration, Camera
 from ..geometry.local_frame import LocalFrame
 from ..io import load
@@ -131,9 +131,12 @@ def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruct
         target, _ = located(whole, cameras, survey.box, bounds, None, config)
         where = run.value(target)
         findings.append(where.findings)
-        if where.parts:
-            views, box = cropped(inputs, whole, where, None, config), where.box
-            run.all(views.pixels, "target")
+        if not where.parts:
+            raise ReconstructionError(
+                "no place lies inside the masks of most views that see it: check the masks' order, and that they are bright inside"
+            )
+        views, box = cropped(inputs, whole, where, None, config), where.box
+        run.all(views.pixels, "target")
         points = no_points(len(cameras))
     planning = planned(views, points, box, bounds is not None or views.masked, config)
     plan: Plan = run.value(planning)

@@ -454,13 +454,13 @@ def _field(
     report: Report,
 ) -> Iterator[Volume]:
     """The signed distance field of filtered depth maps, in parts; of the visual hull where there is no stereo."""
-    masks = list(_Masks(pixels)) if rig.masked else None
+    masks = _Masks(pixels) if rig.masked else None
     if rig.stereo:
         outlines = None if completion is None else completion.silhouettes
         yield from fuse_tiles(depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines)
     elif settings.carve.photo_consistency:
         assert masks is not None
-        hull = visual_hull(masks, rig.cameras, rig.box, settings.volume, report, rig.windows)
+        hull = visual_hull(list(masks), rig.cameras, rig.box, settings.volume, report, rig.windows)
         yield photo_hull(hull, list(_Images(pixels)), rig.cameras, settings.carve, report)
     else:
         nothing, coarse = hull_alone(rig.cameras, settings.volume)

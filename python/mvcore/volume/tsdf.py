@@ -93,6 +93,10 @@ class _Known(Sequence[DepthMap]):
         return DepthMap(empty, empty)
 
 
+_Blocks = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Block coordinates from the first up to the second."""
+
+
 @dataclass(frozen=True)
 class _Fusion:
     """What the tiles of a fusion share: little beside the views' maps, which are read when a tile needs them."""
@@ -194,19 +198,35 @@ class _Fusion:
                 silhouettes.append(_NOTHING)
         return depths, weights, silhouettes
 
+    def _map_bytes(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> int:
+        """Of the maps of all views that may see some blocks."""
+        box = grid.origin + SIDE * grid.voxel * np.stack([low - 1, high + 2])
+        seeing = [c for c, w in zip(self.cameras, self.windows, strict=True) if _may_see(c, w, box)]
+        return sum(c.width * c.height for c in seeing) * (8 if self.outlines is None else 12)
+
+    def _is_wide(self, grid: Volume, whole: _Blocks, halves: Sequence[_Blocks]) -> bool:
+        """Whether the maps of the views that see some blocks take too much memory, and fewer views see either half."""
+        taken = self._map_bytes(grid, *whole)
+        if taken <= self.config.max_memory // 2 or (whole[1] - whole[0]).max() < 2:
+            return False
+        return all(self._map_bytes(grid, *half) < taken for half in halves)
+
     def tiles(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
         """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
         # A block more on every side for the smoothing, and one at the far side, of which the last cells take their samples.
         wide = [np.maximum(low - 1, 0).tolist(), np.minimum(high + 2, grid.blocks).tolist()]
+        axis = int((high - low).argmax())
+        middle = (low[axis] + high[axis]) // 2
+        halves = [(low, np.where(np.arange(3) == axis, middle, high)), (np.where(np.arange(3) == axis, middle, low), high)]
         try:
-            found = self.run(grid, wide, hollow=True)
+            found = None if self._is_wide(grid, (low, high), halves) else self.run(grid, wide, hollow=True)
         except MemoryError as error:
-            axis = int((high - low).argmax())
+            found = None
             if high[axis] - low[axis] < 2:
                 raise ReconstructionError(f"max_memory = {self.config.max_memory} bytes is too little for a volume: {error}") from None
-            middle = (low[axis] + high[axis]) // 2
-            yield from self.tiles(grid, low, np.where(np.arange(3) == axis, middle, high))
-            yield from self.tiles(grid, np.where(np.arange(3) == axis, middle, low), high)
+        if found is None:
+            for part in halves:
+                yield from self.tiles(grid, *part)
             return
         kept = ((found.coords >= low) & (found.coords <= high)).all(1)
         coords, values = found.coords[kept], found.values[kept]
