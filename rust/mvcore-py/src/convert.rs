@@ -45,7 +45,8 @@ pub fn slice_mut<'a, T: Element, D: Dimension>(
     array: &'a mut PyReadwriteArray<'_, T, D>,
     argument: &'static str,
 ) -> PyResult<&'a mut [T]> {
-    let error = || PyValueError::new_err(format!("{argument}: expected a C-contiguous array"));
+    let py = array.py();
+    let error = || unfit(py, argument, "a C-contiguous array", "another");
     if !array.is_c_contiguous() {
         return Err(error());
     }
