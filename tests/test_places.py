@@ -127,6 +127,9 @@ def test_a_folder_of_images_that_the_caller_names(tmp_path):
     assert "in order" in scene.warnings[0]
     with pytest.raises(FileNotFoundError, match=r"no such folder of images"):
         mvcore.load(tmp_path / "calib", images=tmp_path / "nowhere")
+    native(tmp_path / "named", ["x.png", "y.png", "z.png"])
+    with pytest.raises(FormatError, match=r"no image for x.png"):
+        mvcore.load(tmp_path / "named", images=tmp_path / "elsewhere")
     image(tmp_path / "elsewhere" / "more.png")
     with pytest.raises(FormatError, match=r"no image for"):
         mvcore.load(tmp_path / "calib", images=tmp_path / "elsewhere")
