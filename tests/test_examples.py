@@ -53,10 +53,21 @@ def test_the_descent_example_gains_by_moving_knots(tmp_path):
     assert (tmp_path / "a.obj").is_file()
 
 
-DOCUMENTED = ["geometry.cameras", "silhouettes.visual_hull", "config", "depth.stereo", "io.clips", "io.selection", "mesh.surface"]
+MODULES = (
+    "config",
+    "depth.stereo",
+    "geometry.cameras",
+    "geometry.projections",
+    "io.clips",
+    "io.pairing",
+    "io.selection",
+    "mesh.surface",
+    "pipeline.preflight",
+    "silhouettes.visual_hull",
+)
 
 
-@pytest.mark.parametrize("module", [*DOCUMENTED, "pipeline.preflight"])
+@pytest.mark.parametrize("module", MODULES)
 def test_docstrings(module):
     result = doctest.testmod(importlib.import_module(f"mvcore.{module}"), extraglobs={"np": np})
     assert result.attempted > 0

@@ -127,6 +127,9 @@ def test_a_folder_of_images_that_the_caller_names(tmp_path):
     assert "in order" in scene.warnings[0]
     with pytest.raises(FileNotFoundError, match=r"no such folder of images"):
         mvcore.load(tmp_path / "calib", images=tmp_path / "nowhere")
+    native(tmp_path / "named", ["x.png", "y.png", "z.png"])
+    with pytest.raises(FormatError, match=r"no image for x.png"):
+        mvcore.load(tmp_path / "named", images=tmp_path / "elsewhere")
     image(tmp_path / "elsewhere" / "more.png")
     with pytest.raises(FormatError, match=r"no image for"):
         mvcore.load(tmp_path / "calib", images=tmp_path / "elsewhere")
@@ -253,6 +256,18 @@ def test_bare_and_mirrored_projection_matrices(tmp_path):
     assert np.allclose(scene.calib[2].project(working[None, :3]), caller[:2] / caller[2])
     assert (scene.calib[2].to_camera(working[None, :3])[:, 2] > 0).all()
     assert scene.subset([0, 2]).mirrored
+
+
+def test_a_mirrored_world_of_an_archive(tmp_path):
+    cameras = [look_at((2 * np.cos(a), 2 * np.sin(a), 0.5), (0, 0, 0), SIZE, 60.0) for a in range(6)]
+    for n in range(6):
+        image(tmp_path / "image" / f"{n:03d}.png")
+    for flip in (np.eye(4), np.diag([1.0, 1, -1, 1])):
+        matrices = {f"world_mat_{n}": np.vstack([c.projection @ flip, [0, 0, 0, 1]]) for n, c in enumerate(cameras)}
+        np.savez(tmp_path / "cameras_sphere.npz", **matrices)
+        scene = mvcore.load(tmp_path)
+        assert scene.mirrored == (flip[2, 2] < 0)
+        assert np.allclose(scene.calib[3].R, cameras[3].R)
 
 
 def test_reflections_as_k_r_t_are_read_as_a_mirrored_world(tmp_path):

@@ -45,8 +45,8 @@ def cameras_from_projections(
     --------
     >>> P = np.array([[500.0, 0, 320, 0], [0, 500, 240, 0], [0, 0, 1, 4]])
     >>> cameras, mirrored = cameras_from_projections([P, 2 * P], [(640, 480)] * 2)
-    >>> cameras[1].t.tolist(), mirrored
-    ([0.0, 0.0, 4.0], False)
+    >>> [round(float(K), 6) for K in np.diag(cameras[1].K)], mirrored
+    ([500.0, 500.0, 1.0], False)
     """
     names = names or [""] * len(matrices)
     views = list(zip(matrices, sizes, names, strict=True))

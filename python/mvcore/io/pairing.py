@@ -24,6 +24,7 @@ def pair_by_name(
     *,
     partial: bool = False,
     exact: bool = False,
+    in_order: bool = True,
 ) -> list[Path | None]:
     """The file that belongs to each name.
 
@@ -37,7 +38,7 @@ def pair_by_name(
     candidates : files (or folders) to choose from; more than names are allowed, except for pairing by order.
     what : one such file, for messages: ``"mask"``.
     partial : names without a file are allowed and give None, as long as one has a file.
-    exact : names alone decide, neither the numbers in them nor their order.
+    exact : names alone decide, neither the numbers in them nor their order. in_order : the order may decide.
 
     Returns
     -------
@@ -62,7 +63,7 @@ def pair_by_name(
     best = _best(wanted, files, what, _KEYS[:-1] if exact else _KEYS)
     if _paired(best):
         return _whole(wanted, files, best, what, partial)
-    if not exact and len(files) == len(wanted):
+    if in_order and not exact and len(files) == len(wanted):
         order = sorted(range(len(wanted)), key=lambda n: (natural_order(wanted[n].parent), natural_order(wanted[n])))
         ordered: list[Path | None] = [None] * len(wanted)
         for file, n in zip(files, order, strict=True):

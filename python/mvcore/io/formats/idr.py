@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import FormatError, InvalidInputError
 from ...geometry.cameras import Camera
+from ...geometry.projections import cameras_from_projections
 from ..limits import read_npz
 from ..media import frame_files
 from .records import Found, Record
@@ -44,7 +46,10 @@ def read(path: Path) -> Found:
             raise FormatError(f"{path}: world_mat_{n}: {error}") from None
         image = images.get(n)
         records.append(Record(K=camera.K, R=camera.R, t=camera.t, image=image, name=image.name if image else f"{n:06d}"))
-    return Found(records, path, _bounds(arrays.get(f"scale_mat_{numbers[0]}")) if numbers else None)
+    cameras, mirrored = cameras_from_projections([arrays[f"world_mat_{n}"][:3] for n in numbers], [(1, 1)] * len(numbers))
+    records = [replace(r, K=c.K, R=c.R, t=c.t) for r, c in zip(records, cameras, strict=True)]
+    bounds = _bounds(arrays.get(f"scale_mat_{numbers[0]}")) if numbers else None
+    return Found(records, path, bounds, mirrored=mirrored)
 
 
 def _images(path: Path, numbers: list[int]) -> dict[int, Path]:

@@ -7,7 +7,6 @@ x ~ K (R X + t), OpenCV axes, pixel centres at integers. In place of K, R and t 
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from ...errors import FormatError, InvalidInputError
 from ...geometry.projections import cameras_from_projections
 from ...types import Bounds
+from ..limits import read_json
 from .records import Found, Record
 
 NAME = "cameras.json"
@@ -33,20 +33,6 @@ def find(path: Path) -> Path | None:
     if path.suffix.lower() != ".json" or path.name.startswith("transforms"):
         return None
     return path
-
-
-def parse_json(path: Path) -> Any:
-    """A JSON file's content; errors name path and line."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise FormatError(f"{path}:{error.lineno}: {error.msg}") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path}:1: not a text file") from None
-    except RecursionError:
-        raise FormatError(f"{path}: nested too deep") from None
-    except ValueError as error:  # a whole number of thousands of digits
-        raise FormatError(f"{path}: {error}") from None
 
 
 def numbers(where: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
@@ -82,7 +68,7 @@ def path_in(where: str, value: Any) -> Path | None:
 
 def read(path: Path) -> Found:
     """The views of a ``cameras.json``."""
-    data = parse_json(path)
+    data = read_json(path)
     views = data.get("views") if isinstance(data, dict) else None
     if not isinstance(views, list):
         raise FormatError(f"{path}: expected an object with a list 'views'")

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import FormatError
-from .native import numbers, parse_json, path_in, pixels
+from ..limits import read_json
+from .native import numbers, path_in, pixels
 from .records import Found, Record
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -29,7 +30,7 @@ def find(path: Path) -> Path | None:
 
 def read(path: Path) -> Found:
     """The views of a transforms file."""
-    data = parse_json(path)
+    data = read_json(path)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         raise FormatError(f"{path}: expected an object with a list 'frames'")

@@ -210,7 +210,7 @@ def _names(wanted: Sequence[Wanted]) -> list[PurePath]:
 
 
 def _in_folder(wanted: Sequence[Wanted], folder: Path) -> tuple[list[Path | None], list[str]]:
-    """In the caller's folder: by name, by number, or in natural order; or one image in each camera's folder."""
+    """In the caller's folder: by name, by number, or, where the file names no images, in natural order or by cameras' folders."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of images")
     if pairs := _camera_folders(wanted, folder):
@@ -218,8 +218,9 @@ def _in_folder(wanted: Sequence[Wanted], folder: Path) -> tuple[list[Path | None
     files = images_below(folder)
     if not files:
         raise FormatError(f"{folder}: no images")
+    unnamed = all(w.path is None for w in wanted)
     try:
-        pairs = pair_by_name(_names(wanted), files, "image", partial=True)
+        pairs = pair_by_name(_names(wanted), files, "image", partial=True, in_order=unnamed)
     except FormatError as error:
         raise FormatError(f"{folder}: {error}") from None
     return pairs, _in_order(wanted, pairs)

@@ -13,6 +13,7 @@ from ...errors import FormatError, InvalidInputError
 from ...geometry.cameras import Calibration, Camera, same_shape
 from ...types import Bounds
 from ..decode import Header, decode, read_header
+from ..limits import read_text
 from ..scene import Scene
 from .places import IMAGE_SUFFIXES, Places, Wanted, find_images, find_masks_of, no_images, places, with_suffix
 
@@ -22,6 +23,8 @@ FAR = 0.5
 """Principal points farther from the image's centre, in half its sides, belong to another image size or a mistake."""
 FACTORS = (2, 3, 4, 6, 8)
 """Factors by which networks' data sets reduce K but not the images."""
+MOST_LINES = 1 << 30
+"""Bytes of a text file of lines: COLMAP writes every image's points."""
 ALPHAS = 8
 """Images of a set in which transparency is looked for."""
 
@@ -278,10 +281,7 @@ class Lines:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            self.lines = path.read_text(encoding="utf-8-sig", errors="strict").splitlines()
-        except UnicodeDecodeError:
-            raise FormatError(f"{path}:1: not a text file") from None
+        self.lines = read_text(path, MOST_LINES).splitlines()
 
     def fail(self, number: int, message: str) -> FormatError:
         """An error at a line (counted from 1)."""
