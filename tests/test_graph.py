@@ -217,10 +217,11 @@ print(result.report["tasks"]["run"])
 
 def store_digests(folder: Path) -> dict[str, str]:
     found = {}
-    for path in folder.rglob("*"):
-        with contextlib.suppress(FileNotFoundError):  # dropped meanwhile
-            if path.is_file() and len(path.stem) == 40:
-                found[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    for parent, _, names in os.walk(folder):  # unlike rglob, it takes folders that vanish meanwhile
+        for name in names:
+            if len(Path(name).stem) == 40:
+                with contextlib.suppress(FileNotFoundError):
+                    found[name] = hashlib.sha256((Path(parent) / name).read_bytes()).hexdigest()
     return found
 
 
