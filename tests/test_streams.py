@@ -127,6 +127,26 @@ def test_what_is_no_video_is_named(tmp_path):
         open_stream(tmp_path / "b.mp4")
 
 
+@pytest.mark.parametrize(("name", "codec"), [("a.mp4", "libx264"), ("a.mts", "libx264"), ("a.webm", "libvpx")])
+def test_damaged_files_are_read_or_refused(tmp_path, name, codec):
+    data, rng = write_video(tmp_path / name, 20, codec).read_bytes(), np.random.default_rng(7)
+    refused = 0
+    for n in range(25):
+        damaged = bytearray(data)
+        for at in rng.integers(0, len(data), 2 ** int(rng.integers(0, 6))):
+            damaged[at] = rng.integers(0, 256)
+        path = tmp_path / f"{n}{name}"
+        end = len(data) if name == "a.mp4" else rng.integers(len(data) // 2, len(data))  # an MP4's index lies at its end
+        path.write_bytes(damaged[:end])
+        try:
+            frame = video_frame(path, len(open_stream(path)) - 1)
+            assert frame.dtype == np.uint8
+        except FormatError as error:
+            assert str(path) in str(error)  # noqa: PT017
+            refused += 1
+    assert refused < 25
+
+
 def test_frames_pair_by_their_times(tmp_path):
     """Twenty frames of which the tenth to the fourteenth were not taken: the other camera's frames at the same times pair with them."""
     steady = write_video(tmp_path / "a.mkv", 24, rate=25)

@@ -33,6 +33,8 @@ OPEN = 16
 """Videos held open in a process."""
 JITTER = 0.25
 """Share of a frame's time by which timestamps may be off at a constant rate: containers round them, to milliseconds in WebM."""
+MOST_PIXELS = 1 << 27
+"""Pixels of a frame above which a file is refused: 16k by 8k."""
 INVISIBLE = ("vp8",)
 """Codecs some of whose packets are references that are never shown."""
 
@@ -66,7 +68,7 @@ def _reading(path: Path) -> Iterator[None]:
     """FFmpeg's errors as ours, with the path."""
     try:
         yield
-    except (av.FFmpegError, ValueError) as error:
+    except (av.FFmpegError, ValueError, IndexError) as error:  # PyAV looks up streams that damaged packets name
         if isinstance(error, FormatError):
             raise
         reason = getattr(error, "strerror", None) or str(error)
@@ -79,9 +81,13 @@ def _open(path: Path) -> tuple[Any, Any]:
     with _reading(path):
         container = av.open(str(path), metadata_errors="replace")
         stream = next((s for s in container.streams.video if not s.disposition & av.stream.Disposition.attached_pic), None)
-        if stream is None:
+        if stream is None or stream.codec_context is None:
             container.close()
-            raise FormatError(f"{path}: holds no video")
+            raise FormatError(f"{path}: holds no video of a codec that FFmpeg knows")
+        size = (stream.codec_context.width, stream.codec_context.height)
+        if size[0] * size[1] > MOST_PIXELS:
+            container.close()
+            raise FormatError(f"{path}: expected frames of at most {MOST_PIXELS >> 20} megapixels, got {size[0]} x {size[1]}")
         return container, stream
 
 
@@ -89,7 +95,7 @@ def _frames(container: Any, stream: Any) -> Iterator[Any]:
     """Decoded frames in the order in which they are shown; a damaged end is an end."""
     try:
         yield from container.decode(stream)
-    except av.FFmpegError:
+    except (av.FFmpegError, IndexError):
         return
 
 
@@ -142,7 +148,7 @@ def _packets(container: Any, stream: Any) -> tuple[NDArray[np.int64], NDArray[np
             shown.append(packet.pts)
             if packet.is_keyframe:
                 keys.append(packet.pts)
-    except av.FFmpegError:
+    except (av.FFmpegError, IndexError):
         pass  # a damaged end: what came before counts
     if not keys or len(set(shown)) < len(shown):
         return None
