@@ -1,12 +1,15 @@
 """Files made to do harm: refused in one line by mvcore's own errors, before memory or time is spent."""
 
-import io
+import importlib
 import json
+import pkgutil
+import re
 import struct
 import time
 import zipfile
 
 import cv2
+import mvcore
 import numpy as np
 import pytest
 import trimesh
@@ -178,11 +181,35 @@ def test_nurbs_obj(tmp_path, lines):
         load_obj(path)
 
 
+def patterns():
+    """Every regular expression that a module of the package holds, by its place."""
+    out = {}
+    for module in pkgutil.walk_packages(mvcore.__path__, "mvcore."):
+        if not module.name.startswith(("mvcore.network", "mvcore.nurbs.torch")):
+            for name, value in vars(importlib.import_module(module.name)).items():
+                if isinstance(value, re.Pattern):
+                    out[f"{module.name}.{name}"] = value
+    return out
+
+
+@pytest.mark.parametrize("place", sorted(patterns()))
+def test_the_time_of_a_regular_expression_grows_with_the_length_alone(place):
+    pattern = patterns()[place]
+    # Patterns of lines are searched for in whole files, the others are matched with a line, a word or a name.
+    apply = pattern.findall if pattern.flags & re.MULTILINE else pattern.match
+    for start in ("", "(", '"', "<a ", "cam"):
+        for part in (" ", "\n", "\t", "1", "1 ", "1.", ".", "1e1", "-", "a", "a.", "a=", "( 1", "(", "[", '"', "_", "\\", "a: "):
+            text = start + part * 20_000 + "\x01"
+            begin = time.process_time()
+            apply(text.encode() if isinstance(pattern.pattern, bytes) else text)
+            assert time.process_time() - begin < 1, f"{start}{part} .."  # milliseconds where it does; tens of seconds by the square
+
+
 def test_reading_takes_little_time(tmp_path):
     """Files of which the time to read grew with the square of their size."""
     (tmp_path / "README.txt").write_text("\n" * 60_000 + "(" + "1" * 60_000)
     (tmp_path / "x_par.txt").write_text("0\n")
     start = time.process_time()
     with pytest.raises(FormatError):
-        __import__("mvcore").load(tmp_path)
-    assert time.process_time() - start < 2, io
+        mvcore.load(tmp_path)
+    assert time.process_time() - start < 2

@@ -10,7 +10,8 @@ import numpy as np
 from ...types import Bounds
 from .records import Found, Lines, Record
 
-NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+# Digits are limited: the time to refuse a line of them alone would grow with the square of its length.
+NUMBER = r"([-+]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][-+]?\d{1,4})?)"
 CORNER = re.compile(rf"^[ \t]*\([ \t]*{NUMBER}[ \t]+{NUMBER}[ \t]+{NUMBER}[ \t]*\)[ \t\r]*$", re.MULTILINE)
 README = 1 << 20
 """Characters of a README in which the box is sought."""
