@@ -89,19 +89,27 @@ def info(
 @app.command()
 def convert(
     path: Annotated[Path, typer.Argument(help="A folder or calibration file of any known format.")],
-    output: Annotated[Path, typer.Argument(help="cameras.json, or a folder for COLMAP or MVSNet files.")],
-    to: Annotated[str | None, typer.Option(help="mvcore, colmap or mvsnet; by default mvcore for .json, else colmap.")] = None,
+    output: Annotated[Path, typer.Argument(help="cameras.json, or a folder for COLMAP, nerfstudio or MVSNet files.")],
+    to: Annotated[str | None, typer.Option(help="mvcore, colmap, nerfstudio or mvsnet; by default mvcore for .json, else colmap.")] = None,
+    images: options.Images = None,
+    allow_outside: options.Outside = False,
 ) -> None:
-    """Calibrations from one format to another."""
+    """Calibrations from one format to another; with sparse points where the images are."""
     from ..io import load, save_calibration
     from ..pipeline.checks import check_writable
+    from ..pipeline.convert import sparse_points
+    from ..types import Report
 
     format = to or ("mvcore" if output.suffix == ".json" else "colmap")
-    scene = load(path, images=False)
+    scene = load(path, images=False if images is None else images, allow_outside=allow_outside)
     shown().warn(scene.warnings)
-    check_writable(output, folder=format != "mvcore")
-    save_calibration(output, scene, format)
-    shown().done(f"{output}: {len(scene)} views as {format}")
+    check_writable(output, folder=format != "mvcore" and output.suffix != ".json")
+    report = Report()
+    points = None if format == "mvcore" else sparse_points(scene, report, shown().track())
+    shown().warn(report.warnings)
+    save_calibration(output, scene, format, points=points)
+    counted = f" and {len(points)} points" if points is not None else ""
+    shown().done(f"{output}: {len(scene)} views{counted} as {format}")
 
 
 @app.command(name="eval")

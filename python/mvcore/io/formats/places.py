@@ -25,7 +25,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".p
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "color", "photos", "frames", "blended_images", "undistorted", "undistorted_images")
 """Usual names of folders of images, the surest first."""
 MASK_FOLDERS = ("masks", "mask", "silhouettes", "mattes")
-INNER = ("sparse", "dense", "colmap", "distorted", "cams", "cams_1", "cameras", "calibration", "bundle")
+INNER = ("sparse", "dense", "colmap", "distorted", "cams", "cams_1", "cameras", "calibration", "bundle", "opensfm")
 """Folders of a calibration inside a data set."""
 REDUCED = re.compile(r"images?_\d+")
 """``images_2``: the same images at a half of their size."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,8 @@ class Record:
     """One view as a file describes it.
 
     ``image`` and ``mask`` are paths as the file names them, relative to its folder, or absolute; None where it names none: the
-    image is then sought by ``name``. A size of 0 is taken from the image. K may be a function of (width, height), where it depends
-    on them.
+    image is then sought by ``name``. A size of 0 is taken from the image. K and the distortion may be functions of (width, height),
+    where they depend on them.
     """
 
     K: Any
@@ -46,7 +46,7 @@ class Record:
     image: Path | None = None
     mask: Path | None = None
     name: str = ""
-    distortion: Sequence[float] = ()
+    distortion: Sequence[float] | Callable[[int, int], Sequence[float]] = ()
     fisheye: bool = False
     line: int = 0
 
@@ -148,8 +148,8 @@ def _with_images(records: Sequence[Record], at: Places, need: bool) -> tuple[lis
 
 def _fitted(record: Record, where: str, need_images: bool) -> tuple[Record, str]:
     """A record at the size of its image, and what was done to it: ``"scaled 1280x852 320x213"``."""
-    if callable(record.K) and record.width:
-        record = replace(record, K=record.K(record.width, record.height))
+    if record.width:
+        record = _of_size(record, record.width, record.height)
     if record.image is None or not record.image.is_file():
         if not record.width:
             raise FormatError(f"{where}: the image size is not in the file, and image {str(record.image or record.name)!r} does not exist")
@@ -159,7 +159,7 @@ def _fitted(record: Record, where: str, need_images: bool) -> tuple[Record, str]
     header = read_header(record.image)
     size, want = (header.width, header.height), (record.width, record.height)
     if callable(record.K):
-        return replace(record, K=record.K(*size), width=size[0], height=size[1]), ""
+        return _of_size(record, *size), ""
     if not record.width:
         k, done = _scaled_principal_point(record.K, size)
         return replace(record, K=k, width=size[0], height=size[1]), done
@@ -170,6 +170,13 @@ def _fitted(record: Record, where: str, need_images: bool) -> tuple[Record, str]
     if same_shape(size, want):
         return _resized(record, where, size), f"scaled {want[0]}x{want[1]} {size[0]}x{size[1]}"
     raise FormatError(_other_shape(record, where, header))
+
+
+def _of_size(record: Record, width: int, height: int) -> Record:
+    """A record whose K and distortion, where they are functions, are those of a size."""
+    k = record.K(width, height) if callable(record.K) else record.K
+    distortion = record.distortion(width, height) if callable(record.distortion) else record.distortion
+    return replace(record, K=k, distortion=distortion, width=width, height=height)
 
 
 def _other_shape(record: Record, where: str, header: Header) -> str:
