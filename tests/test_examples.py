@@ -53,7 +53,17 @@ def test_the_descent_example_gains_by_moving_knots(tmp_path):
     assert (tmp_path / "a.obj").is_file()
 
 
-DOCUMENTED = ["geometry.cameras", "silhouettes.visual_hull", "config", "depth.stereo", "io.clips", "io.selection", "mesh.surface"]
+DOCUMENTED = [
+    "geometry.cameras",
+    "silhouettes.visual_hull",
+    "config",
+    "depth.stereo",
+    "io.clips",
+    "io.selection",
+    "mesh.surface",
+    "pipeline.store",
+    "pipeline.cluster",
+]
 
 
 @pytest.mark.parametrize("module", [*DOCUMENTED, "pipeline.preflight"])
