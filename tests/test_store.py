@@ -338,7 +338,7 @@ def test_the_command(store):
     assert "removed 1 results (0.1 MB)" in done.output
     assert run("--max-size", "150k").exit_code == 0
     assert keys(store) == ["entry0"]
-    for wrong, text in [(("--older-than", "soon"), "such as 7d"), (("--max-size", "2X"), "such as 2G")]:
+    for wrong, text in [(("--older-than", "soon"), "such as 7d"), (("--max-size", "2X"), "such as 4G")]:
         done = run(*wrong)
         assert done.exit_code == 2
         assert text in done.output

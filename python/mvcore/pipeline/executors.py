@@ -36,9 +36,9 @@ def local_workers() -> int:
 class ExecutorPool:
     """On an executor. One of processes that breaks, as a worker died, is replaced by another like it."""
 
-    def __init__(self, executor: Executor, interrupt: _core.Interrupt | None = None) -> None:
+    def __init__(self, executor: Executor) -> None:
         self.executor = executor
-        self._interrupt = interrupt
+        self._interrupt = _core.Interrupt() if isinstance(executor, ThreadPoolExecutor) else None
         self._lock = Lock()
         self._stopped = Event()
         self._replaced = False
@@ -90,7 +90,7 @@ class ExecutorPool:
     def _send(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Future[Any], Executor]:
         executor = self.executor
         try:
-            return executor.submit(function, *arguments), executor
+            return executor.submit(*self._call(function, arguments)), executor
         except BrokenExecutor as error:
             return self._send_again(function, arguments, executor, error)
 
@@ -104,7 +104,19 @@ class ExecutorPool:
                 if self._replaced:
                     broken.shutdown(wait=False)
                 self._replaced = True
-            return self.executor.submit(function, *arguments), self.executor
+            return self.executor.submit(*self._call(function, arguments)), self.executor
+
+    def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        return (function, *arguments) if self._interrupt is None else (_under, self._interrupt, function, *arguments)
+
+
+def _under(interrupt: _core.Interrupt, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Does work in a thread whose kernels end with the pool's flag."""
+    interrupt.enter()
+    try:
+        return function(*arguments)
+    finally:
+        _core.Interrupt().enter()  # other users' work in this thread does not
 
 
 def _lost(error: Exception) -> bool:
@@ -160,9 +172,8 @@ def open_pool(executor: Executor | None = None, scheduler: str | Cluster | None 
 
 @contextmanager
 def _threads() -> Iterator[ExecutorPool]:
-    interrupt = _core.Interrupt()
-    threads = ThreadPoolExecutor(local_workers(), thread_name_prefix="mvcore", initializer=interrupt.enter)
-    pool = ExecutorPool(threads, interrupt)
+    threads = ThreadPoolExecutor(local_workers(), thread_name_prefix="mvcore")
+    pool = ExecutorPool(threads)
     try:
         yield pool
     except BaseException:
