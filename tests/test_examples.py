@@ -53,7 +53,7 @@ def test_the_descent_example_gains_by_moving_knots(tmp_path):
     assert (tmp_path / "a.obj").is_file()
 
 
-MODULES = (
+DOCUMENTED = (
     "config",
     "depth.stereo",
     "geometry.cameras",
@@ -62,12 +62,14 @@ MODULES = (
     "io.pairing",
     "io.selection",
     "mesh.surface",
+    "pipeline.cluster",
     "pipeline.preflight",
+    "pipeline.store",
     "silhouettes.visual_hull",
 )
 
 
-@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("module", DOCUMENTED)
 def test_docstrings(module):
     result = doctest.testmod(importlib.import_module(f"mvcore.{module}"), extraglobs={"np": np})
     assert result.attempted > 0

@@ -217,11 +217,11 @@ print(result.report["tasks"]["run"])
 
 def store_digests(folder: Path) -> dict[str, str]:
     found = {}
-    for parent, _, names in os.walk(folder):  # unlike rglob, it takes folders that vanish meanwhile
-        for name in names:
-            if len(Path(name).stem) == 40:
-                with contextlib.suppress(FileNotFoundError):
-                    found[name] = hashlib.sha256((Path(parent) / name).read_bytes()).hexdigest()
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [f for f in folders if not f.startswith(".")]  # what is being written
+        for name in (n for n in names if len(Path(n).stem) == 40):
+            with contextlib.suppress(FileNotFoundError):  # dropped meanwhile
+                found[name] = hashlib.sha256(Path(parent, name).read_bytes()).hexdigest()
     return found
 
 

@@ -62,7 +62,7 @@ def test_a_folder_imports_only_folders_above_it(layer):
 
 def test_kernels_do_not_import_each_other():
     source = PACKAGE.parents[1] / "rust" / "mvcore" / "src"
-    nouns = {"error", "memory", "raster", "grid", "mesh", "candidates"}
+    nouns = {"error", "interrupt", "memory", "raster", "grid", "mesh", "candidates"}
     below = {
         "slanted": {"patch"},
         "sweep": {"patch"},

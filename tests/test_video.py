@@ -152,15 +152,15 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(local, folder, tmp_pa
 
 def test_a_finished_run_is_not_done_again(local, folder):
     out, _ = local
-    stamps = {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*.npz")}
+    stamps = {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*.entry")}
     again = reconstruct_video(load_video(folder), target="rigid", config=SETTINGS, workdir=out / "work")
     assert len(list(again)) == 4
-    assert {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*.npz")} == stamps
+    assert {p: p.stat().st_mtime_ns for p in (out / "work").rglob("*.entry")} == stamps
     # Another setting is another result.
     other = reconstruct_video(load_video(folder, stop=1), config=SETTINGS | {"surface": {"max_faces": 500}}, workdir=out / "work")
     (result,) = other
     assert len(result.faces) <= 600
-    assert set((out / "work").rglob("*.npz")) > set(stamps)
+    assert set((out / "work").rglob("*.entry")) > set(stamps)
 
 
 def test_a_real_cluster_gives_the_same_bytes_and_survives_a_lost_worker(local, folder, tmp_path):
@@ -181,7 +181,7 @@ def test_a_real_cluster_gives_the_same_bytes_and_survives_a_lost_worker(local, f
             import threading
 
             def kill():
-                while len(list((tmp_path / "work").rglob("*.npz"))) < 20:
+                while len(list((tmp_path / "work").rglob("*.entry"))) < 20:
                     time.sleep(0.05)
                 workers[0].kill()
 

@@ -1,12 +1,14 @@
 """The Rust kernels. Arrays must be C-contiguous; wrong shapes raise `ValueError`, bad values `InvalidInputError`."""
 
 from collections.abc import Sequence
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
     "Atlas",
+    "Interrupt",
     "aggregate",
     "carve",
     "close_holes",
@@ -50,6 +52,12 @@ _U32 = NDArray[np.uint32]
 _I16 = NDArray[np.int16]
 _I32 = NDArray[np.int32]
 _I64 = NDArray[np.int64]
+
+@final
+class Interrupt:
+    def __new__(cls) -> Interrupt: ...
+    def enter(self) -> None: ...
+    def set(self) -> None: ...
 
 def sweep(reference: _U8, images: Sequence[_U8], maps: _F32, planes: _F32, best: int = 0) -> _U8: ...
 def aggregate(costs: _U8, guide: _U8, p1: int, p2: int, p2_falloff: int) -> tuple[_F32, _F32]: ...

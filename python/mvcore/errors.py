@@ -19,6 +19,14 @@ class ReconstructionError(MvcoreError, RuntimeError):
     """The input is valid but cannot be reconstructed; the message says why."""
 
 
+class Interrupted(MvcoreError, RuntimeError):
+    """A kernel was ended before it was done, as the work it belongs to was given up."""
+
+
+class InternalError(MvcoreError, RuntimeError):
+    """A kernel panicked, which is a bug of mvcore; the message says where."""
+
+
 def require(condition: object, argument: str, expected: str, got: object) -> None:
     """Raise `InvalidInputError` unless ``condition`` holds."""
     if not condition:

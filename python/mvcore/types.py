@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import logging
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+LOGGER = logging.getLogger("mvcore")
+"""Warnings go here as soon as they are known; whoever uses the library decides where they show."""
+LOGGER.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
 
@@ -62,10 +67,8 @@ class Report:
 
     values: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
-    listener: Callable[[str], None] | None = None
 
     def warn(self, message: str) -> None:
-        """Keep a warning for the user, and tell the listener at once."""
+        """Keep a warning for the user, and log it at once."""
         self.warnings.append(message)
-        if self.listener:
-            self.listener(message)
+        LOGGER.warning(message)

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from .progress import console
+
 DONE, DOUBTFUL, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done; done with warnings under ``--strict``; bad input; Ctrl-C."""
 UsageProblem: type[Exception] = typer.BadParameter.__mro__[2]
@@ -35,7 +37,8 @@ class Shown:
             if message not in self.warnings:
                 self.warnings.append(message)
                 if not self.quiet:
-                    print(f"warning: {message}", file=sys.stderr)
+                    # Above the progress bars, where there are any.
+                    console().print(f"warning: {message}", markup=False, highlight=False, soft_wrap=True)
 
     def note(self, message: str) -> None:
         """A hint or a detail, on stderr."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from . import reconstruct, tools, train, video
+from . import clean, reconstruct, tools, train, video
 from .app import app
 
-__all__ = ["app", "main", "reconstruct", "tools", "train", "video"]
+__all__ = ["app", "clean", "main", "reconstruct", "tools", "train", "video"]
 
 
 def main() -> None:

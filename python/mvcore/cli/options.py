@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, require
 
 if TYPE_CHECKING:
     from ..config import Config
     from ..io.scene import Scene
+    from ..pipeline.cluster import Cluster
 
 INPUT, OUTPUT, SETTINGS, RUNNING = "Input", "Output", "Settings", "Running"
 """Groups of the help."""
@@ -37,7 +39,12 @@ Closed = Annotated[
 Matcher = Annotated[str | None, typer.Option(help="sgm (classical), or dcnn (with the network).", rich_help_panel=SETTINGS)]
 Device = Annotated[str | None, typer.Option(help="Where the network runs: cpu or cuda.", rich_help_panel=SETTINGS)]
 Workdir = Annotated[Path | None, typer.Option(help="Keeps results; an interrupted run goes on there.", rich_help_panel=RUNNING)]
-Scheduler = Annotated[str | None, typer.Option(help="A dask.distributed scheduler, tcp://host:port.", rich_help_panel=RUNNING)]
+Scheduler = Annotated[
+    str | None, typer.Option(help="A dask.distributed scheduler, tcp://host:port or tls://host:port.", rich_help_panel=RUNNING)
+]
+TlsCa = Annotated[Path | None, typer.Option(help="The cluster's certificate authority, a PEM file, for tls://.", rich_help_panel=RUNNING)]
+TlsCert = Annotated[Path | None, typer.Option(help="This client's certificate, a PEM file.", rich_help_panel=RUNNING)]
+TlsKey = Annotated[Path | None, typer.Option(help="The key of that certificate, a PEM file.", rich_help_panel=RUNNING)]
 MaxMemory = Annotated[str | None, typer.Option(help="Memory that the run may take, e.g. 4G or 800M.", rich_help_panel=RUNNING)]
 Jobs = Annotated[int | None, typer.Option(help="Processors to use; all of them by default.", rich_help_panel=RUNNING)]
 
@@ -97,18 +104,33 @@ def settings_of(
     return config
 
 
-def running(workdir: Path | None, scheduler: str | None, max_memory: str | None, jobs: int | None) -> dict[str, Any]:
+def cluster_of(scheduler: str | None, tls: Sequence[Path | None]) -> Cluster | None:
+    """The cluster that ``--scheduler`` and the options for TLS (authority, certificate, key) name."""
+    from ..pipeline.cluster import Cluster
+
+    if scheduler is None:
+        require(not any(tls), "--tls-ca, --tls-cert, --tls-key", "--scheduler tls://host:port with them", "none")
+        return None
+    try:
+        cluster = Cluster(scheduler, *tls)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"--{str(error).replace('_', '-').replace(', tls', ', --tls')}") from None
+    cluster.check_files()
+    return cluster
+
+
+def running(
+    workdir: Path | None, scheduler: str | None, max_memory: str | None, jobs: int | None, tls: Sequence[Path | None] = (None,) * 3
+) -> dict[str, Any]:
     """Keyword arguments of `reconstruct` and `reconstruct_video` on how to run; only those that were asked for.
 
     ``--jobs`` bounds the threads of kernels, too, which start with the first kernel: nothing has run before.
     """
     if jobs is not None and not 1 <= jobs <= 4096:
         raise InvalidInputError(f"--jobs: expected a whole number from 1 to 4096 (processors), got {jobs}")
-    if scheduler is not None and not re.fullmatch(r"[a-z]+://[^\s/]+", scheduler):
-        raise InvalidInputError(f"--scheduler: expected an address such as tcp://host:8786, got {scheduler!r}")
     arguments: dict[str, Any] = {
         "workdir": workdir,
-        "scheduler": scheduler,
+        "scheduler": cluster_of(scheduler, tls),
         "max_memory": None if max_memory is None else parse_size("--max-memory", max_memory),
     }
     if jobs is not None:

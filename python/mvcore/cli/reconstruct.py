@@ -37,6 +37,9 @@ def reconstruct(
     device: options.Device = None,
     workdir: options.Workdir = None,
     scheduler: options.Scheduler = None,
+    tls_ca: options.TlsCa = None,
+    tls_cert: options.TlsCert = None,
+    tls_key: options.TlsKey = None,
     max_memory: options.MaxMemory = None,
     jobs: options.Jobs = None,
 ) -> None:
@@ -46,7 +49,7 @@ def reconstruct(
     check_mesh_name(output, "--output")
     box = options.parse_box(bounds)
     settings = options.settings_of(config, matcher, device, max_image_size, max_faces, closed)
-    how = options.running(workdir, scheduler, max_memory, jobs)
+    how = options.running(workdir, scheduler, max_memory, jobs, (tls_ca, tls_cert, tls_key))
     scene, numbers = options.chosen(_scene(path, images, allow_outside), only, exclude)
     targets = _masks(scene, masks)
     from ..pipeline.preflight import preflight

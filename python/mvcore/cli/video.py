@@ -49,6 +49,9 @@ def video(
     device: options.Device = None,
     workdir: options.Workdir = None,
     scheduler: options.Scheduler = None,
+    tls_ca: options.TlsCa = None,
+    tls_cert: options.TlsCert = None,
+    tls_key: options.TlsKey = None,
     max_memory: options.MaxMemory = None,
     jobs: options.Jobs = None,
 ) -> None:
@@ -62,7 +65,7 @@ def video(
     settings = options.settings_of(config, matcher, device, max_image_size, max_faces, closed)
     if scheduler is not None and workdir is None:
         workdir = output / "work"  # a temporary folder would be this machine's alone
-    how = options.running(workdir, scheduler, max_memory, jobs)
+    how = options.running(workdir, scheduler, max_memory, jobs, (tls_ca, tls_cert, tls_key))
     choice = {"only": only, "exclude": exclude, "allow_outside": allow_outside, "rotation": rotate}
     clips = load_video(path if images is None else images, calib or path, start=start, stop=stop, stride=stride, **choice)
     before = preflight_clips(clips, box, settings, folders=[output], workdir=workdir, max_memory=how.get("max_memory"))

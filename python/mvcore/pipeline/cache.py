@@ -70,10 +70,10 @@ class Cache:
         self._keep(key, value, sum(a.nbytes for a in arrays.values()))
 
     def drop(self, key: str) -> None:
-        """Forget a value, on disk as well."""
+        """Forget a value, on disk as well unless other runs are there."""
         with self._lock:
             self._held -= self._values.pop(key, (None, 0))[1]
-        self.store.path(key).unlink(missing_ok=True)
+        self.store.drop(key)
 
     def _keep(self, key: str, value: Any, size: int) -> None:
         with self._lock:

@@ -4,14 +4,28 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import Any
+from threading import Event, Lock
+from typing import Any, Protocol
 
-from ..errors import InvalidInputError, MvcoreError
+from .. import _core
+from ..errors import Interrupted, InvalidInputError, ReconstructionError
+from ..types import LOGGER
+from .cluster import LOOK, Cluster, name_of, open_cluster
 
 ATTEMPTS = 4
 """Times that a piece of work is sent out before its loss is an error."""
+
+
+class Pool(Protocol):
+    """Sends out pure functions, and again where a worker was lost."""
+
+    def start(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        """Sends out ``function(*arguments)``; calling what comes back waits for the result."""
+
+    def stop(self) -> None:
+        """Gives the work up: what has not begun is cancelled, and all that waits for results ends with `Interrupted`."""
 
 
 def local_workers() -> int:
@@ -19,72 +33,151 @@ def local_workers() -> int:
     return max(2, min(4, (os.cpu_count() or 1) // 4))
 
 
-class Pool:
-    """Sends pure functions to an executor, and again where a worker was lost."""
+class ExecutorPool:
+    """On an executor. One of processes that breaks, as a worker died, is replaced by another like it."""
 
     def __init__(self, executor: Executor) -> None:
         self.executor = executor
+        self._interrupt = _core.Interrupt() if isinstance(executor, ThreadPoolExecutor) else None
+        self._lock = Lock()
+        self._stopped = Event()
+        self._replaced = False
 
     def start(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        """Sends out ``function(*arguments)``; calling what comes back waits for the result."""
-        future = self.executor.submit(function, *arguments)
+        """Sends out ``function(*arguments)``; calling what comes back waits for the result.
+
+        Raises
+        ------
+        ReconstructionError
+            From what comes back: the workers that did it were lost again and again, or the executor is of no more use.
+        Interrupted
+            From what comes back: the work was given up.
+        """
+        first = self._send(function, arguments)
 
         def result() -> Any:
-            pending: Future[Any] = future
-            for attempt in range(ATTEMPTS):
+            future, executor = first
+            for _ in range(ATTEMPTS):
                 try:
-                    return pending.result()
-                except MvcoreError:
-                    raise
+                    return self._result(future)
                 except Exception as error:
-                    if attempt + 1 == ATTEMPTS or not _lost(error):
+                    if not _lost(error):
                         raise
-                    pending = self.executor.submit(function, *arguments)
-            raise AssertionError("unreachable")
+                    future, executor = self._send_again(function, arguments, executor, error)
+            name = name_of(function, arguments)
+            raise ReconstructionError(f"executor: workers were lost {ATTEMPTS} times while they did {name} (out of memory?)")
 
         return result
+
+    def stop(self) -> None:
+        """Gives the work up: waits end, and kernels that run in threads of this pool do."""
+        self._stopped.set()
+        if self._interrupt is not None:
+            self._interrupt.set()
+
+    def close(self) -> None:
+        """Shuts down what took the place of a broken executor."""
+        if self._replaced:
+            self.executor.shutdown(cancel_futures=True)
+
+    def _result(self, future: Future[Any]) -> Any:
+        while not wait([future], timeout=LOOK).done:
+            if self._stopped.is_set():
+                future.cancel()
+                raise Interrupted("the work was given up")
+        return future.result()
+
+    def _send(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Future[Any], Executor]:
+        executor = self.executor
+        try:
+            return executor.submit(*self._call(function, arguments)), executor
+        except BrokenExecutor as error:
+            return self._send_again(function, arguments, executor, error)
+
+    def _send_again(
+        self, function: Callable[..., Any], arguments: tuple[Any, ...], broken: Executor, error: Exception
+    ) -> tuple[Future[Any], Executor]:
+        with self._lock:
+            if isinstance(error, BrokenExecutor) and self.executor is broken:
+                self.executor = _like(broken, error)
+                LOGGER.warning("a worker process died; what it did is done again")
+                if self._replaced:
+                    broken.shutdown(wait=False)
+                self._replaced = True
+            return self.executor.submit(*self._call(function, arguments)), self.executor
+
+    def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        return (function, *arguments) if self._interrupt is None else (_under, self._interrupt, function, *arguments)
+
+
+def _under(interrupt: _core.Interrupt, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Does work in a thread whose kernels end with the pool's flag."""
+    interrupt.enter()
+    try:
+        return function(*arguments)
+    finally:
+        _core.Interrupt().enter()  # other users' work in this thread does not
 
 
 def _lost(error: Exception) -> bool:
     """Whether an error says that the worker is gone, not that the work is wrong."""
-    return isinstance(error, CancelledError | ConnectionError | BrokenExecutor) or type(error).__name__ in (
-        "KilledWorker",
-        "CommClosedError",
-    )
+    return isinstance(error, BrokenExecutor | CancelledError | ConnectionError) or type(error).__name__ == "CommClosedError"
+
+
+def _like(broken: Executor, error: Exception) -> Executor:
+    """A new pool of processes with the settings of a broken one."""
+    if type(broken) is not ProcessPoolExecutor:
+        raise ReconstructionError(f"executor: its workers are gone ({error})") from error
+    names = ("max_workers", "mp_context", "initializer", "initargs", "max_tasks_per_child")
+    settings = {name: getattr(broken, f"_{name}", None) for name in names}
+    return ProcessPoolExecutor(**{name: value for name, value in settings.items() if value is not None})
 
 
 @contextmanager
-def open_pool(executor: Executor | None = None, scheduler: str | None = None) -> Iterator[Pool]:
-    """A pool on the caller's executor, on the cluster at ``scheduler`` (``tcp://host:port``), or of local threads.
+def open_pool(executor: Executor | None = None, scheduler: str | Cluster | None = None) -> Iterator[Pool]:
+    """A pool on the caller's executor, on the cluster of a scheduler, or of local threads.
+
+    When the block ends by an exception, local kernels that still run end within a fraction of a second.
+
+    Parameters
+    ----------
+    executor : any `concurrent.futures.Executor`; it is left open.
+    scheduler : address of a dask.distributed scheduler (``tcp://host:port`` or ``tls://host:port``), or a `Cluster` with the files for TLS.
 
     Raises
     ------
     InvalidInputError
-        Both are given, or dask.distributed is not installed.
+        Both are given, the address is none, or dask.distributed is not installed.
+    ReconstructionError
+        The scheduler does not answer.
     """
     if executor is not None and scheduler is not None:
         raise InvalidInputError("executor, scheduler: expected one of them, got both")
     if executor is not None:
-        yield Pool(executor)
-    elif scheduler is not None:
-        with _cluster(scheduler) as pool:
-            yield pool
-    else:
-        own = ThreadPoolExecutor(local_workers(), thread_name_prefix="mvcore")
+        pool = ExecutorPool(executor)
         try:
-            yield Pool(own)
+            yield pool
+        except BaseException:
+            pool.stop()
+            raise
         finally:
-            own.shutdown(cancel_futures=True)
+            pool.close()
+    elif scheduler is not None:
+        with open_cluster(scheduler, ATTEMPTS) as cluster:
+            yield cluster
+    else:
+        with _threads() as pool:
+            yield pool
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Pool]:
+def _threads() -> Iterator[ExecutorPool]:
+    threads = ThreadPoolExecutor(local_workers(), thread_name_prefix="mvcore")
+    pool = ExecutorPool(threads)
     try:
-        from distributed import Client
-    except ImportError:
-        raise InvalidInputError(
-            "scheduler: expected dask.distributed to be installed (pip install 'mvcore[cluster]'), got no such package"
-        ) from None
-    with Client(address, timeout="30s") as client:
-        # The scheduler sends work of a lost worker to another by itself.
-        yield Pool(client.get_executor(retries=ATTEMPTS, pure=False))
+        yield pool
+    except BaseException:
+        pool.stop()
+        raise
+    finally:
+        threads.shutdown(cancel_futures=True)

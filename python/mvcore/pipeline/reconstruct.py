@@ -19,6 +19,7 @@ from ..io.images import find_masks
 from ..io.scene import Scene
 from ..types import Bounds, Frame, SparsePoints, Track, no_track
 from .checks import as_box
+from .cluster import Cluster
 from .graph import FrameTasks, Inputs, Run, Views, cropped, frame_tasks, located, overview, planned, reduced_cameras, run_frame, surveyed
 from .report import assembled
 from .result import Reconstruction
@@ -44,7 +45,7 @@ def reconstruct(
     track: Track | None = None,
     workdir: str | Path | None = None,
     executor: Executor | None = None,
-    scheduler: str | None = None,
+    scheduler: str | Cluster | None = None,
     max_memory: int | None = None,
 ) -> Reconstruction:
     """Calibrated images in, a textured mesh out.
@@ -59,7 +60,8 @@ def reconstruct(
     track : wraps the iterables of long stages, to show progress.
     workdir : folder that keeps results by content; the same call goes on there after an interruption. By default a temporary one.
     executor : where the work runs, any `concurrent.futures` executor; by default threads of this process.
-    scheduler : address of a dask.distributed scheduler instead, ``tcp://host:port``; all its workers must see ``workdir``.
+    scheduler : address of a dask.distributed scheduler instead, ``tcp://host:port``, or a `Cluster` with TLS;
+        all its workers must see ``workdir``.
     max_memory : bytes that the process may take beyond what it takes idle.
 
     Returns

@@ -17,7 +17,9 @@ from ..config import Config
 from ..errors import require
 from ..types import DepthMap
 from .cache import Cache
+from .cluster import Cluster
 from .executors import local_workers, open_pool
+from .store import Store
 from .tasks import Place, Runner, Task
 
 CACHE = 512 << 20
@@ -97,7 +99,7 @@ TASK_LEAST = 64 << 20
 def open_session(
     workdir: str | Path | None,
     executor: Executor | None,
-    scheduler: str | None,
+    scheduler: str | Cluster | None,
     budget: int,
     threads: int,
 ) -> Iterator[tuple[Workdir, Runner]]:
@@ -109,6 +111,7 @@ def open_session(
         require(os.access(place.folder, os.W_OK), "workdir", "a folder that can be written", str(place.folder))
     through = remote or not place.temporary
     with (
+        Store(place.folder).lease(),
         open_pool(executor, scheduler) if remote else nullcontext() as pool,
         Runner(Place(place.folder, budget, through), pool, REMOTE_THREADS if remote else threads) as runner,
     ):

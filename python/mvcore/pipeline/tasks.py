@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from .. import _core
 from ..errors import ReconstructionError
 from ..types import Track
 from .cache import Cache, Missing, cache_of, forget
@@ -186,7 +187,8 @@ class Runner:
 
     def __init__(self, place: Place, pool: Pool | None, threads: int) -> None:
         self.place, self.cache, self.pool = place, place.cache(), pool
-        self._dispatch = ThreadPoolExecutor(threads, thread_name_prefix="mvcore-task")
+        self._interrupt = _core.Interrupt()
+        self._dispatch = ThreadPoolExecutor(threads, thread_name_prefix="mvcore-task", initializer=self._interrupt.enter)
         self._futures: dict[str, Future[None]] = {}
         self._known: dict[str, tuple[Task[Any], Ledger]] = {}
         self._lock = threading.RLock()
@@ -195,10 +197,19 @@ class Runner:
     def __enter__(self) -> Runner:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is not None:
+            self.stop()
         self._stopped = True
         self._dispatch.shutdown(cancel_futures=True)
         forget(self.place.folder)
+
+    def stop(self) -> None:
+        """Give the run up: kernels of this process end within a fraction of a second, and nothing else begins."""
+        self._stopped = True
+        self._interrupt.set()
+        if self.pool is not None:
+            self.pool.stop()
 
     def start(self, wanted: Task[Any], ledger: Ledger) -> Future[None]:
         """See to it that a task's result is there; the future is done once it is. The ledger counts what it takes."""

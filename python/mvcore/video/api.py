@@ -18,6 +18,7 @@ from ..geometry.local_frame import LocalFrame
 from ..io.clips import Clips, Source, load_video
 from ..io.images import find_pictures, read_image, undistort
 from ..pipeline.checks import as_box
+from ..pipeline.cluster import Cluster
 from ..pipeline.result import Reconstruction
 from ..types import Image, Track, no_track
 from .run import ClipRun, Job
@@ -72,7 +73,7 @@ def reconstruct_video(
     target: str = "free",
     config: Config | Mapping[str, Any] | None = None,
     executor: Executor | None = None,
-    scheduler: str | None = None,
+    scheduler: str | Cluster | None = None,
     workdir: str | Path | None = None,
     max_memory: int | None = None,
     track: Track | None = None,
@@ -90,7 +91,8 @@ def reconstruct_video(
     bounds : ((x0, y0, z0), (x1, y1, z1)) in the world, in which targets are.
     target : ``free``, or ``rigid``: the target's poses are found and all instants fuse into one model.
     executor : where the work runs, any concurrent.futures executor; by default local threads.
-    scheduler : address of a dask.distributed scheduler instead, ``tcp://host:port``; ``workdir`` must then be a folder that all share.
+    scheduler : address of a dask.distributed scheduler instead, ``tcp://host:port``, or a `Cluster` with TLS;
+        ``workdir`` must then be a folder that all share.
     workdir : keeps results by content; the same call goes on there after an interruption. By default a temporary folder.
     max_memory : bytes that the process may take beyond what it takes idle.
 

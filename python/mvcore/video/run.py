@@ -18,6 +18,7 @@ from ..geometry.cameras import Calibration
 from ..geometry.local_frame import LocalFrame
 from ..io.clips import Clips
 from ..pipeline import rigid, stages
+from ..pipeline.cluster import Cluster
 from ..pipeline.graph import (
     Before,
     FrameTasks,
@@ -116,7 +117,7 @@ class ClipRun:
     out: Outcome
     rigid: bool
     executor: Executor | None
-    scheduler: str | None
+    scheduler: str | Cluster | None
     workdir: Any
     max_memory: int | None
     track: Track
@@ -150,6 +151,9 @@ class ClipRun:
                 yield self._reconstruction(results[-1], tracker, learnt, world)
             if self.rigid:
                 self._model(Run(runner, self.job.config, self.track), results, world)
+        except BaseException:
+            runner.stop()
+            raise
         finally:
             self.stopped = True
             drivers.shutdown(cancel_futures=True)

@@ -1,7 +1,9 @@
-//! Between Python and the kernels: borrowed arrays, returned arrays, the one mapping of errors, the one way out of Python.
+//! Between Python and the kernels: borrowed arrays, returned arrays, the one mapping of errors.
 
+use crate::interrupt::place_of_panic;
+pub use crate::interrupt::{run, run_briefly};
+use mvcore::Error;
 use mvcore::raster::{Epipolar, Raster};
-use mvcore::{Error, Result};
 use ndarray::{Array, Dimension, IntoDimension};
 use numpy::{
     Element, IntoPyArray, PyArray, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3, PyReadwriteArray,
@@ -11,19 +13,23 @@ use pyo3::exceptions::{PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyAnyMethods;
 
-/// Runs a kernel without the interpreter lock and maps its error.
-pub fn run<T: Send>(py: Python<'_>, kernel: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
-    py.detach(kernel).map_err(|error| to_python(py, &error))
-}
-
-fn to_python(py: Python<'_>, error: &Error) -> PyErr {
+/// The Python exception of a kernel's error.
+pub fn to_python(py: Python<'_>, error: &Error) -> PyErr {
     let class = match error {
         Error::InvalidInput { .. } => "InvalidInputError",
         Error::File { .. } => "FormatError",
+        Error::Interrupted => "Interrupted",
+        Error::Internal { .. } => "InternalError",
         Error::OutOfMemory { .. } => return PyMemoryError::new_err(error.to_string()),
     };
-    let raised = py.import("mvcore.errors").and_then(|m| m.getattr(class)).and_then(|c| c.call1((error.to_string(),)));
-    raised.map_or_else(|_| PyValueError::new_err(error.to_string()), PyErr::from_value)
+    let mut text = error.to_string();
+    if let Error::Internal { message } = error
+        && let Some(place) = place_of_panic(message)
+    {
+        text = format!("{text} ({place})");
+    }
+    let raised = py.import("mvcore.errors").and_then(|m| m.getattr(class)).and_then(|c| c.call1((&text,)));
+    raised.map_or_else(|_| PyValueError::new_err(text), PyErr::from_value)
 }
 
 /// The error of an argument that does not fit its contract.

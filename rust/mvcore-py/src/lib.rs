@@ -4,6 +4,7 @@ mod checks;
 mod convert;
 mod depth;
 mod files;
+mod interrupt;
 mod nurbs;
 mod sparse;
 mod texture;
@@ -18,6 +19,8 @@ mod _core {
     #[pymodule_export]
     use crate::files::{encode_png, read_obj};
     #[pymodule_export]
+    use crate::interrupt::Interrupt;
+    #[pymodule_export]
     use crate::nurbs::{
         nurbs_basis, nurbs_control_gradient, nurbs_curve, nurbs_curve_control_gradient, nurbs_curve_knot_gradient,
         nurbs_knot_gradient, nurbs_surface, nurbs_surface_grid, nurbs_surface_partials,
@@ -31,4 +34,10 @@ mod _core {
         carve, close_holes, components, consistency, distance_transform, fuse, isosurface_dense, isosurface_sparse,
         nearest, photo_carve,
     };
+
+    #[pymodule_init]
+    fn init(_module: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {
+        crate::interrupt::keep_panics();
+        Ok(())
+    }
 }

@@ -1,7 +1,7 @@
 //! NURBS kernels: control nets, knots and parameters in; points, derivatives and gradients out.
 
 use crate::checks::check;
-use crate::convert::{array, run, slice};
+use crate::convert::{array, run_briefly, slice};
 use mvcore::error::require;
 use mvcore::memory;
 use mvcore::nurbs::{self, Derivative, Knots, Net};
@@ -23,7 +23,7 @@ pub fn nurbs_basis<'py>(
     order: usize,
 ) -> PyResult<(Bound<'py, PyArray1<i64>>, Bound<'py, PyArray3<f64>>)> {
     let (knots, u) = (slice(&knots, "knots")?, slice(&u, "u")?);
-    let (first, values, columns) = run(py, || {
+    let (first, values, columns) = run_briefly(py, || {
         let knots = Knots::new("knots", knots, count)?;
         knots.check("u", u)?;
         require(order <= nurbs::MAX_ORDER, "order", format!("at most {}", nurbs::MAX_ORDER), order)?;
@@ -54,7 +54,7 @@ pub fn nurbs_curve<'py>(
 ) -> PyResult<Bound<'py, PyArray3<f64>>> {
     let [n, dim] = [control.shape()[0], control.shape()[1]];
     let (control, knots, u) = (slice(&control, "control_points")?, slice(&knots, "knots")?, slice(&u, "u")?);
-    let (out, dim) = run(py, || {
+    let (out, dim) = run_briefly(py, || {
         let net = Net::new("control_points", control, n, 1, dim, rational)?;
         Ok((nurbs::curve_points(&net, &Knots::new("knots", knots, n)?, u, order)?, net.dim_out()))
     })?;
@@ -76,7 +76,7 @@ pub fn nurbs_surface<'py>(
     let (control, ku, kv) =
         (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v) = (slice(&u, "u")?, slice(&v, "v")?);
-    let (out, dim) = run(py, || {
+    let (out, dim) = run_briefly(py, || {
         let net = Net::new("control_points", control, m, n, dim, rational)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
         let wanted = nurbs::triangle(order)?;
@@ -101,7 +101,7 @@ pub fn nurbs_surface_partials<'py>(
         (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v) = (slice(&u, "u")?, slice(&v, "v")?);
     let wanted: Vec<Derivative> = orders.iter().enumerate().map(|(slot, &(u, v))| Derivative { u, v, slot }).collect();
-    let out = run(py, || {
+    let out = run_briefly(py, || {
         let net = Net::new("control_points", control, m, n, dim, false)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
         nurbs::surface_points(&net, knots, u, v, &wanted, wanted.len())
@@ -124,7 +124,7 @@ pub fn nurbs_surface_grid<'py>(
     let (control, ku, kv) =
         (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v) = (slice(&u, "u")?, slice(&v, "v")?);
-    let (out, dim) = run(py, || {
+    let (out, dim) = run_briefly(py, || {
         let net = Net::new("control_points", control, m, n, dim, rational)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
         let orders = order.saturating_add(1).saturating_mul(order.saturating_add(1));
@@ -149,7 +149,7 @@ pub fn nurbs_control_gradient<'py>(
     check(py, dim > 0, "gradient", "at least one coordinate", dim)?;
     let (ku, kv) = (slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v, gradient) = (slice(&u, "u")?, slice(&v, "v")?, slice(&gradient, "gradient")?);
-    let out = run(py, || {
+    let out = run_briefly(py, || {
         let knots = [&Knots::new("knots_u", ku, counts.0)?, &Knots::new("knots_v", kv, counts.1)?];
         memory::room("gradient", &[counts.0, counts.1, dim, size_of::<f64>()])?;
         nurbs::control_gradient(knots, u, v, gradient, dim, [orders.0, orders.1])
@@ -170,7 +170,9 @@ pub fn nurbs_curve_control_gradient<'py>(
     let dim = gradient.shape()[1];
     check(py, dim > 0, "gradient", "at least one coordinate", dim)?;
     let (knots, u, gradient) = (slice(&knots, "knots")?, slice(&u, "u")?, slice(&gradient, "gradient")?);
-    let out = run(py, || nurbs::curve_control_gradient(&Knots::new("knots", knots, count)?, u, gradient, dim, order))?;
+    let out = run_briefly(py, || {
+        nurbs::curve_control_gradient(&Knots::new("knots", knots, count)?, u, gradient, dim, order)
+    })?;
     array(py, out, (count, dim))
 }
 
@@ -188,7 +190,7 @@ pub fn nurbs_knot_gradient<'py>(
     let (control, ku, kv) =
         (slice(&control, "control_points")?, slice(&knots.0, "knots_u")?, slice(&knots.1, "knots_v")?);
     let (u, v, gradient) = (slice(&u, "u")?, slice(&v, "v")?, slice(&gradient, "gradient")?);
-    let mut out = run(py, || {
+    let mut out = run_briefly(py, || {
         let net = Net::new("control_points", control, m, n, dim, false)?;
         let knots = [&Knots::new("knots_u", ku, m)?, &Knots::new("knots_v", kv, n)?];
         nurbs::knot_gradient(&net, knots, u, v, gradient)
@@ -209,7 +211,7 @@ pub fn nurbs_curve_knot_gradient<'py>(
     let [n, dim] = [control.shape()[0], control.shape()[1]];
     let (control, knots) = (slice(&control, "control_points")?, slice(&knots, "knots")?);
     let (u, gradient) = (slice(&u, "u")?, slice(&gradient, "gradient")?);
-    let out = run(py, || {
+    let out = run_briefly(py, || {
         let net = Net::new("control_points", control, n, 1, dim, false)?;
         nurbs::curve_knot_gradient(&net, &Knots::new("knots", knots, n)?, u, gradient)
     })?;

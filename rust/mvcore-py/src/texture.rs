@@ -8,8 +8,8 @@ use mvcore::rate_faces::Photo;
 use mvcore::select_views::SelectParams;
 use mvcore::shade::{Shots, Surface};
 use numpy::{
-    PyArray1, PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
-    PyReadonlyArray4, PyReadwriteArray2, PyReadwriteArray3, PyUntypedArrayMethods,
+    PyArray1, PyArray2, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
+    PyReadwriteArray2, PyReadwriteArray3, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 
@@ -73,7 +73,12 @@ impl Lists<'_> {
         };
         if self.1.shape() != [n, slots] || self.2.shape() != [n, slots, 3] {
             let expected = format!("shapes ({n}, {slots}), ({n}, {slots}, 3)");
-            return Err(unfit(py, "qualities, colours", &expected, format!("{:?}, {:?}", self.1.shape(), self.2.shape())));
+            return Err(unfit(
+                py,
+                "qualities, colours",
+                &expected,
+                format!("{:?}, {:?}", self.1.shape(), self.2.shape()),
+            ));
         }
         let views = slice_mut(&mut self.0, "views")?;
         let (qualities, colours) = (slice_mut(&mut self.1, "qualities")?, slice_mut(&mut self.2, "colours")?);

@@ -12,6 +12,7 @@
 //! intensity step (his eq 13). The order of operations is fixed: the same bytes for any thread count.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
 use crate::raster::Raster;
 use multiversion::multiversion;
@@ -54,7 +55,7 @@ pub fn aggregate(costs: &[u8], planes: usize, guide: Raster<u8>, penalties: Pena
     let (sums_top, sums_bottom) = sums.split_at_mut(top * w * planes);
     let (plane_top, plane_bottom) = winners.plane.split_at_mut(top * w);
     let (margin_top, margin_bottom) = winners.margin.split_at_mut(top * w);
-    let volume = Volume { costs, planes, guide, p1, p2: p2_table(penalties) };
+    let volume = Volume { costs, planes, guide, p1, p2: p2_table(penalties), interrupt: Interrupt::current() };
     let (mut forward, mut backward) = (Pass::new(&volume, false), Pass::new(&volume, true));
     rayon::join(
         || store(&volume, &mut forward, 0..top, sums_top),
@@ -81,6 +82,7 @@ struct Volume<'a> {
     guide: Raster<'a, u8>,
     p1: u8,
     p2: [u8; 256],
+    interrupt: Interrupt,
 }
 
 /// Bytes before and after a pixel's path costs, so that d-1 and d+1 exist; they hold 255.
@@ -121,6 +123,7 @@ impl Pass {
 fn store(volume: &Volume, pass: &mut Pass, rows: std::ops::Range<usize>, sums: &mut [u16]) {
     let (first, n) = (rows.start, volume.guide.width * volume.planes);
     for y in ordered(rows, pass.backward) {
+        volume.interrupt.poll();
         row_pass::<false>(volume, pass, y, &mut sums[(y - first) * n..][..n]);
     }
 }
@@ -136,6 +139,7 @@ fn finish(
     let (first, w) = (rows.start, volume.guide.width);
     let n = w * volume.planes;
     for y in ordered(rows, pass.backward) {
+        volume.interrupt.poll();
         let (line, at) = (&mut sums[(y - first) * n..][..n], (y - first) * w);
         row_pass::<true>(volume, pass, y, line);
         winners_of_row(line, volume.planes, &mut plane[at..at + w], &mut margin[at..at + w]);

@@ -10,6 +10,7 @@
 //! take the colours of their neighbours from a [`palette`](crate::palette).
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::level::level;
 use crate::mesh::{Mesh, NOTHING, components, neighbours, project};
 use crate::pack::pack;
@@ -241,7 +242,9 @@ impl Atlas {
     /// Applies gains and corrections to the charts' pixels.
     fn correct(&mut self, corrections: &[[f32; 3]], gains: &[[f32; 3]]) {
         let mut pixels = std::mem::take(&mut self.pixels);
+        let interrupt = Interrupt::current();
         pixels.par_iter_mut().zip(&self.charts).zip(&self.members).for_each(|((pixels, chart), members)| {
+            interrupt.poll();
             let shift = self.shifts(chart, members, corrections);
             for (rgb, shift) in pixels.as_chunks_mut::<3>().0.iter_mut().zip(shift) {
                 for k in 0..3 {

@@ -12,6 +12,7 @@
 
 use crate::error::{Result, require};
 use crate::grid::{Grid, SIDE};
+use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
 use crate::raster::Raster;
 use multiversion::multiversion;
@@ -51,10 +52,12 @@ pub fn carve(grid: Grid, views: &[Silhouette], params: &CarveParams) -> Result<V
     let [nx, ny, nz] = grid.shape;
     let all: Vec<u8> = (0..views.len()).map(|v| v as u8).collect();
     let mut out = zeroed::<bool>(nx * ny * nz);
+    let interrupt = Interrupt::current();
     out.par_chunks_mut(SIDE * ny * nz).enumerate().for_each(|(slab, out)| {
         let mut task = Task { grid: &grid, views, tables: &tables, params, first: slab * SIDE, out };
         for j in (0..ny).step_by(PARENT) {
             for k in (0..nz).step_by(PARENT) {
+                interrupt.poll();
                 let parent = Cells::new([slab * SIDE, j, k], [SIDE, PARENT, PARENT], grid.shape);
                 if let Some((open, votes)) = task.settle(&parent, &all, Votes::default()) {
                     task.descend(&parent, &open, votes);

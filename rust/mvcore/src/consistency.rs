@@ -10,6 +10,7 @@
 //! before the point could not see it; one that looks through the point to something farther could, and disagrees.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::raster::{Epipolar, Raster};
 use rayon::prelude::*;
 
@@ -52,7 +53,9 @@ pub fn consistency(
     require(params.min_views >= 1, "min_views", "at least 1", params.min_views)?;
     let (w, n) = (depth.width, depth.width * depth.height);
     let (mut kept, mut support) = (vec![0.0f32; n], vec![0u8; n]);
+    let interrupt = Interrupt::current();
     kept.par_chunks_mut(w).zip(support.par_chunks_mut(w)).enumerate().for_each(|(y, (kept, support))| {
+        interrupt.poll();
         for x in 0..w {
             let z = depth.data[y * w + x];
             if z > 0.0 {

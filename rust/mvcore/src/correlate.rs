@@ -10,6 +10,7 @@
 //! (CVPR 2019); the torch form that this equals is `mvcore.network.cost.correlate`.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
 use crate::raster::Epipolar;
 use multiversion::multiversion;
@@ -99,9 +100,13 @@ pub fn correlate(
     for (n, row) in out.chunks_exact_mut(w * groups).enumerate() {
         rows[n % h].push(row);
     }
+    let interrupt = Interrupt::current();
     rows.into_par_iter().enumerate().for_each_init(
         || vec![0.0f32; sources.len() * d * groups],
-        |own, (y, mut rows)| row(reference, sources, planes, visibility, y, own, &mut rows),
+        |own, (y, mut rows)| {
+            interrupt.poll();
+            row(reference, sources, planes, visibility, y, own, &mut rows);
+        },
     );
     Ok(out)
 }

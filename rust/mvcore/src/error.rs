@@ -31,6 +31,15 @@ pub enum Error {
         /// Why it could not be read.
         reason: String,
     },
+    /// The caller ended the kernel before it was done ([`crate::interrupt`]).
+    #[error("interrupted")]
+    Interrupted,
+    /// A kernel panicked: a bug of its own.
+    #[error("internal error, please report it: {message}")]
+    Internal {
+        /// The panic's message.
+        message: String,
+    },
 }
 
 /// Shorthand of every kernel's return type.

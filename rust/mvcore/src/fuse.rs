@@ -14,6 +14,7 @@
 use crate::error::{Error, Result, require};
 use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
 use crate::hull::{SoftSilhouette, cut_block, deep_inside, mark_hull, restrict_to_hull};
+use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
 use crate::raster::Raster;
 use crate::smooth::{Beyond, Bits, Measured, smooth};
@@ -140,7 +141,11 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
     }
     let mut values = zeroed::<f32>(map.coords.len() * BLOCK);
     let mut bits = vec![Bits::default(); map.coords.len()];
+    let interrupt = Interrupt::current();
     values.par_chunks_exact_mut(BLOCK).zip(&mut bits).zip(map.coords.par_iter()).for_each(|((out, bits), at)| {
+        if interrupt.is_set() {
+            return;
+        }
         let cut = |out: &mut [f32]| {
             cut_block(&grid, *at, &silhouettes, params.hull_tolerance, params.truncation, out);
         };
@@ -159,6 +164,7 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
             }
         }
     });
+    interrupt.poll();
     if params.smoothing > 0.0 {
         // With silhouettes what no block covers is outside the hull.
         let beyond = if hull == Hull::Cuts { Beyond::Outside(&inside) } else { Beyond::Unknown };
@@ -203,8 +209,9 @@ fn contents(
     params: &FusionParams,
     flags: &[bool],
 ) -> Vec<Content> {
+    let interrupt = Interrupt::current();
     let content = |(n, &flag): (usize, &bool)| {
-        if !flag {
+        if !flag || interrupt.is_set() {
             return Content::Outside;
         }
         let at = tile.block(n).map(|v| v as u32);
@@ -229,7 +236,9 @@ fn contents(
             Content::Mixed
         }
     };
-    flags.par_iter().enumerate().map(content).collect()
+    let contents = flags.par_iter().enumerate().map(content).collect();
+    interrupt.poll();
+    contents
 }
 
 /// Whether a block and all 26 around it hold the same: no cell of any holds a surface, nor does smoothing reach one.
@@ -251,7 +260,9 @@ fn amid(tile: &Tile, n: usize, contents: &[Content]) -> bool {
 fn mark_surface(grid: &Grid, tile: &Tile, view: &FusionView, truncation: f64, flags: &[AtomicBool]) {
     let block = grid.voxel * SIDE as f64;
     let rays = Rays::of(&view.projection);
+    let interrupt = Interrupt::current();
     (0..view.depth.height).into_par_iter().for_each(|y| {
+        interrupt.poll();
         for (x, &z) in view.depth.row(y).iter().enumerate() {
             if z <= 0.0 {
                 continue;

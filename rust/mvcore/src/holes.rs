@@ -8,6 +8,7 @@
 //! an open piece of surface, or would need an edge that the mesh has already. Rims are independent: the same faces for any number of threads.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::mesh::{Mesh, NOTHING, neighbours, normal};
 use rayon::prelude::*;
 use std::collections::{HashMap, HashSet};
@@ -34,7 +35,12 @@ pub fn close_holes(mesh: Mesh<'_>, most_edges: usize) -> Result<Vec<[u32; 3]>> {
         .map(|(a, b)| edge(a, b))
         .collect();
     edges.par_sort_unstable();
-    let patches: Vec<Vec<[u32; 3]>> = loops.par_iter().map(|rim| patch(mesh, rim, &edges)).collect();
+    let interrupt = Interrupt::current();
+    let closed = |rim: &Vec<Rim>| {
+        interrupt.poll();
+        patch(mesh, rim, &edges)
+    };
+    let patches: Vec<Vec<[u32; 3]>> = loops.par_iter().map(closed).collect();
     Ok(without_shared_edges(patches))
 }
 

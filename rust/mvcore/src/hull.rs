@@ -9,6 +9,7 @@
 //! of it: voxels ask only the views whose border may matter to them, and get what asking all views would give.
 
 use crate::grid::{Grid, SIDE, Tile};
+use crate::interrupt::Interrupt;
 use crate::raster::Raster;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -53,9 +54,13 @@ fn for_each_block(
 ) {
     let half = 0.5 * SIDE as f64;
     let radius = (half * grid.voxel * 3f64.sqrt()) as f32;
+    let interrupt = Interrupt::current();
     flags.par_iter().enumerate().for_each_init(
         || Vec::with_capacity(views.len()),
         |outside, (index, flag)| {
+            if interrupt.is_set() {
+                return;
+            }
             let corner = tile.block(index);
             let p = std::array::from_fn(|a| grid.origin[a] + grid.voxel * (corner[a] as f64 * SIDE as f64 + half));
             outside.clear();
@@ -64,6 +69,7 @@ fn for_each_block(
             tell(vote.distance(outside, tolerance), radius * 1.2, flag);
         },
     );
+    interrupt.poll();
 }
 
 /// What the silhouettes say of a whole block, and those of them that must be asked of each of its voxels.

@@ -14,6 +14,7 @@
 use crate::cube::{EDGES, TRIANGLES};
 use crate::error::Result;
 use crate::grid::{BLOCK, BlockMap, Grid, NONE, SIDE, Tile};
+use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -99,7 +100,9 @@ impl Samples for Dense<'_> {
         let [nx, ny, nz] = self.shape;
         let mut bits = zeroed::<Bits>(map.coords.len());
         let [_, y, z] = map.tile.dims();
+        let interrupt = Interrupt::current();
         bits.par_chunks_exact_mut(z).enumerate().for_each(|(line, out)| {
+            interrupt.poll();
             let (i0, j0) = (line / y * SIDE, line % y * SIDE);
             for i in i0..nx.min(i0 + SIDE) {
                 for j in j0..ny.min(j0 + SIDE) {
@@ -238,11 +241,13 @@ fn extract<S: Samples>(map: &BlockMap, samples: &S) -> Surface {
     let kinds: Vec<u8> = bits.par_iter().map(Bits::kinds).collect();
     let partial = bits.par_iter().any(|b| b.valid != [!0; SIDE]);
     let mut field = Field { map, bits, active: Vec::new(), number: zeroed(map.coords.len()) };
+    let interrupt = Interrupt::current();
     let found: Vec<Vec<Crossings>> = map
         .coords
         .par_chunks(TASK)
         .enumerate()
         .map(|(task, coords)| {
+            interrupt.poll();
             let near = |(n, &at): (usize, &[u32; 3])| {
                 let slots = field.around(at);
                 let mixed = slots.iter().filter_map(|&s| kinds.get(s as usize)).fold(0, |a, b| a | b) == 3;
@@ -313,7 +318,9 @@ fn emit<S: Samples>(field: &Field, samples: &S, out: &mut Surface) {
         (f, faces) = faces.split_at_mut(end_f - first.face as usize);
         tasks.push((blocks, v, f));
     }
+    let interrupt = Interrupt::current();
     tasks.into_par_iter().for_each(|(blocks, v, f)| {
+        interrupt.poll();
         let (mut v, mut f) = (v.iter_mut(), f.iter_mut());
         for block in blocks {
             let slots = field.around(field.map.coords[block.slot as usize]);

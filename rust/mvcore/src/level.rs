@@ -8,6 +8,7 @@
 //! Corrections vary slowly, so a lattice far coarser than the mesh carries them: a hundredth of the unknowns of one a vertex. Lempitsky and
 //! Ivanov, CVPR 2007. Sums run in a fixed order: the same bytes for any number of threads.
 
+use crate::interrupt::Interrupt;
 use rayon::prelude::*;
 
 /// Pixels between the nodes.
@@ -132,7 +133,9 @@ impl Lattice {
         let mut p = z.clone();
         let mut rz = dot(&r, &z);
         let goal = rz.map(|v| v * 1e-6 + 1e-30);
+        let interrupt = Interrupt::current();
         for _ in 0..MOST_ITERATIONS {
+            interrupt.poll();
             if (0..3).all(|c| rz[c] <= goal[c]) {
                 break;
             }

@@ -1,6 +1,6 @@
 //! Multi-view stereo kernels in plain Rust: arrays in, arrays out, no Python, no I/O beyond mesh and atlas files.
 //!
-//! Order of the modules: [`error`] ← nouns ([`memory`], [`raster`], [`grid`], [`mesh`], [`candidates`]) ← one file a kernel. Six kernels stand on a part
+//! Order of the modules: [`error`] ← nouns ([`interrupt`], [`memory`], [`raster`], [`grid`], [`mesh`], [`candidates`]) ← one file a kernel. Six kernels stand on a part
 //! of their own: [`slanted`] and [`sweep`] on [`patch`], [`isosurface`] on [`cube`], [`fuse`] on [`smooth`], [`shade`] on [`rasterize`], [`atlas`] on
 //! [`pack`], [`level`] and [`palette`]; no other calls another. [`nurbs`] is a family of its own that uses only [`error`] and [`memory`]. Threads come from rayon's
 //! global pool; every kernel gives the same bytes for any number of them.
@@ -21,6 +21,7 @@ pub mod fuse;
 pub mod grid;
 pub mod holes;
 pub mod hull;
+pub mod interrupt;
 pub mod isosurface;
 pub mod level;
 pub mod match_epipolar;

@@ -5,6 +5,7 @@
 //! among repeated structure that an unguided search loses.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -36,18 +37,31 @@ pub fn match_epipolar(
     require(band > 0.0, "band", "a positive width", band)?;
     let f = fundamental;
     let transposed = [f[0], f[3], f[6], f[1], f[4], f[7], f[2], f[5], f[8]];
-    let (there, back) = rayon::join(|| best(a, b, fundamental, band, ratio), || best(b, a, &transposed, band, ratio));
+    let interrupt = &Interrupt::current();
+    let best = |from, to, f| best(from, to, f, band, ratio, interrupt);
+    let (there, back) = rayon::join(|| best(a, b, fundamental), || best(b, a, &transposed));
+    interrupt.poll();
     let mutual =
         |(i, m): (usize, &Option<u32>)| m.filter(|&j| back[j as usize] == Some(i as u32)).map(|j| [i as u32, j]);
     Ok(there.iter().enumerate().filter_map(mutual).collect())
 }
 
-fn best(a: Features, b: Features, fundamental: &[f64; 9], band: f32, ratio: f32) -> Vec<Option<u32>> {
+fn best(
+    a: Features,
+    b: Features,
+    fundamental: &[f64; 9],
+    band: f32,
+    ratio: f32,
+    interrupt: &Interrupt,
+) -> Vec<Option<u32>> {
     let columns: Vec<f32> = b.positions.iter().map(|p| p[0]).collect();
     let rows: Vec<f32> = b.positions.iter().map(|p| p[1]).collect();
     (0..a.positions.len())
         .into_par_iter()
         .map(|i| {
+            if interrupt.is_set() {
+                return None;
+            }
             let line = epipolar_line(fundamental, a.positions[i]);
             best_of_one(&a.descriptors[i], line, (&columns, &rows), b.descriptors, band, ratio)
         })
@@ -117,7 +131,8 @@ mod tests {
 
     #[test]
     fn the_twin_on_the_line_is_taken_and_the_better_one_off_it_is_not() {
-        let describe = |seed: u8| std::array::from_fn(|k| seed.wrapping_mul(31).wrapping_add((k as u8).wrapping_mul(3)) / 4);
+        let describe =
+            |seed: u8| std::array::from_fn(|k| seed.wrapping_mul(31).wrapping_add((k as u8).wrapping_mul(3)) / 4);
         let mut near = describe(1);
         near[0] += 20;
         let a = Features { positions: &[[10., 20.]], descriptors: &[describe(1)] };

@@ -9,6 +9,7 @@
 //! is selected directly, and pixels in whose window nothing differs are passed over.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::raster::Raster;
 use rayon::prelude::*;
 
@@ -46,7 +47,9 @@ pub fn weighted_median(
     require(params.slack >= 0.0, "slack", "0 or more", params.slack)?;
     let near = Weights::new(params);
     let mut out = vec![0.0f32; w * h];
+    let interrupt = Interrupt::current();
     out.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
+        interrupt.poll();
         let mut samples = Vec::with_capacity(near.offsets.len());
         for (x, value) in row.iter_mut().enumerate() {
             let mine = values.row(y)[x];

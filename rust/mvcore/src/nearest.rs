@@ -8,6 +8,7 @@
 //! The tree is the order of the points itself: a range's median splits it. Bentley, CACM 1975.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use rayon::prelude::*;
 
 /// Points below which a range is searched one by one.
@@ -26,7 +27,9 @@ pub fn nearest(points: &[[f64; 3]], others: &[[f64; 3]], reach: f64) -> Result<(
     let mut tree: Vec<Node> =
         others.iter().enumerate().map(|(n, &at)| Node { at, number: n as u32, axis: 0 }).collect();
     build(&mut tree);
+    let interrupt = Interrupt::current();
     let search = |p: &[f64; 3]| {
+        interrupt.poll();
         let mut best = (reach * reach, u32::MAX);
         find(&tree, p, &mut best);
         if best.1 == u32::MAX { (f64::INFINITY, -1) } else { (best.0.sqrt(), i64::from(best.1)) }

@@ -12,6 +12,7 @@
 
 use crate::error::{Result, require};
 use crate::grid::Grid;
+use crate::interrupt::Interrupt;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -120,7 +121,9 @@ fn sweep(
     let across = [grid.shape[others[0]], grid.shape[others[1]]];
     let depth = [nx, ny, nz][axis];
     let mut cleared = 0;
+    let interrupt = Interrupt::current();
     for step in 0..depth {
+        interrupt.poll();
         let plane = if ascending { step } else { depth - 1 - step };
         let at = grid.origin[axis] + grid.voxel * plane as f64;
         let before: Vec<usize> = (0..photos.len())

@@ -4,6 +4,7 @@
 //! same bytes come out for any thread count. 1/z is linear on the image, depth is z along the optical axis.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::mesh::{Mesh, NOTHING, project};
 use rayon::prelude::*;
 
@@ -31,8 +32,10 @@ pub fn rasterize(mesh: Mesh, projection: &[f64; 12], width: usize, height: usize
         }
     }
     let (mut depth, mut hit) = (vec![0.0f32; width * height], vec![NOTHING; width * height]);
+    let interrupt = Interrupt::current();
     depth.par_chunks_mut(BAND * width).zip(hit.par_chunks_mut(BAND * width)).zip(&lists).enumerate().for_each(
         |(band, ((depth, hit), list))| {
+            interrupt.poll();
             for &n in list {
                 let p = mesh.faces[n as usize].map(|v| points[v as usize]);
                 draw(p, width, band * BAND, depth.len() / width, |at, z| {

@@ -10,6 +10,7 @@
 
 use crate::candidates::Candidates;
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::mesh::{Mesh, NOTHING, components, neighbours};
 use rayon::prelude::*;
 
@@ -46,12 +47,15 @@ pub fn select_views(mesh: Mesh, lists: &mut Candidates, gains: &[[f32; 3]], para
     }
     let scale = 1.0 / percentile_95(lists).max(1e-12);
     let mut labels = start(lists, &around, gains.len());
+    let interrupt = Interrupt::current();
     for _ in 0..SWEEPS {
+        interrupt.poll();
         if !sweep(lists, &around, scale, params.seam, &mut labels) {
             break;
         }
     }
     for _ in 0..MERGES {
+        interrupt.poll();
         if !merge_small(lists, &around, params.least_patch, &mut labels) {
             break;
         }
@@ -107,7 +111,9 @@ fn start(lists: &Candidates, around: &[[i32; 3]], views: usize) -> Vec<i32> {
     let (mut labels, mut best) = (vec![NOTHING; n], vec![0.0f32; n]);
     // Where a face stands among those that have the view.
     let mut place = vec![NONE; n];
+    let interrupt = Interrupt::current();
     for view in 0..views as i32 {
+        interrupt.poll();
         let members: Vec<u32> =
             (0..n as u32).into_par_iter().filter(|&f| lists.quality(f as usize, view) > 0.0).collect();
         members.iter().zip(0..).for_each(|(&f, i)| place[f as usize] = i);

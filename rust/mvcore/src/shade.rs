@@ -6,6 +6,7 @@
 //! image; `samples`² samples a pixel are averaged, but inside a surface one in their middle does for all.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::mesh::{Mesh, NOTHING, project};
 use crate::rasterize::rasterize;
 use nalgebra::{Matrix3, Vector3};
@@ -79,7 +80,9 @@ fn shade_one(
         let pixel = Vector3::new(x as f64, y as f64, 1.0);
         inverse * (pixel * f64::from(z) - p4)
     };
+    let interrupt = Interrupt::current();
     image.par_chunks_mut(shots.width * 3).enumerate().for_each(|(y, row)| {
+        interrupt.poll();
         let mut samples = Vec::with_capacity(n * n);
         for x in 0..shots.width {
             samples.clear();

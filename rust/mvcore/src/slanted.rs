@@ -13,6 +13,7 @@
 //! for any thread count.
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::patch::{Affine, GREY_ZERO, OFFSETS, Quads, SAMPLES, SumsOf, Window, sums_for_this_cpu};
 use crate::raster::{Epipolar, Raster};
 use rayon::prelude::*;
@@ -151,7 +152,9 @@ impl Scene<'_> {
         f: impl Fn((usize, usize), &mut View, Hypothesis) -> Hypothesis + Sync,
     ) {
         let width = self.reference.width;
+        let interrupt = Interrupt::current();
         planes.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+            interrupt.poll();
             for (x, h) in row.iter_mut().enumerate().filter(|(x, _)| chosen((*x, y))) {
                 if h.w == 0.0 {
                     *h = Hypothesis { w: self.prior[y * width + x], ..Default::default() };

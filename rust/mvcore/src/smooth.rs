@@ -11,6 +11,7 @@
 //! number of threads.
 
 use crate::grid::{BLOCK, BlockMap, NONE, SIDE};
+use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -58,9 +59,13 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measur
     // Open surfaces have free space on one side and nothing behind: far values must not outweigh the surface's own.
     let least = if matches!(beyond, Beyond::Outside(_)) { 1.0 } else { FAR_WEIGHT };
     let mut out = zeroed::<f32>(values.len());
+    let interrupt = Interrupt::current();
     out.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).enumerate().for_each_init(
         || (vec![[0.0f32; 2]; WIDE * WIDE * WIDE], vec![[0.0f32; 2]; WIDE * WIDE * WIDE]),
         |(wide, share), (slot, (out, at))| {
+            if interrupt.is_set() {
+                return;
+            }
             wide.fill(if matches!(beyond, Beyond::Outside(_)) { [1.0, 1.0] } else { [0.0; 2] });
             gather(values, map, *at, least, beyond, wide);
             let values = &values[slot * BLOCK..][..BLOCK];
@@ -86,6 +91,7 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measur
             }
         },
     );
+    interrupt.poll();
     out
 }
 

@@ -11,6 +11,7 @@
 //! Collins (CVPR 1996), best half after Kang, Szeliski and Chai (CVPR 2001).
 
 use crate::error::{Result, require};
+use crate::interrupt::Interrupt;
 use crate::patch::Quads;
 use crate::raster::{Epipolar, Raster};
 use multiversion::multiversion;
@@ -49,8 +50,9 @@ pub fn sweep(
     let (w, h, d) = (reference.width, reference.height, planes.len());
     let sources: Vec<_> = sources.iter().map(|(image, map)| (Quads::new(*image), *map)).collect();
     let mut costs = vec![0u8; w * h * d];
+    let interrupt = Interrupt::current();
     costs.par_chunks_mut(BAND * w * d).enumerate().for_each(|(i, out)| {
-        sweep_band(reference, &sources, planes, best, i * BAND, out);
+        sweep_band(reference, &sources, planes, best, i * BAND, &interrupt, out);
     });
     Ok(costs)
 }
@@ -101,6 +103,7 @@ fn sweep_band(
     planes: &[f32],
     best: usize,
     y0: usize,
+    interrupt: &Interrupt,
     out: &mut [u8],
 ) {
     let (w, d) = (reference.width, planes.len());
@@ -115,6 +118,7 @@ fn sweep_band(
     let mut scratch = Sums::new(w);
     let mut taps = Taps::new(warped.stride);
     for (plane, &inverse_depth) in planes.iter().enumerate() {
+        interrupt.poll();
         lowest.fill(INVALID);
         for (source, map) in sources {
             warp(source, map, inverse_depth, y0 as f32, w, rows, &mut taps, &mut warped, &mut valid);
