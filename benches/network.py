@@ -154,7 +154,7 @@ def views(arguments):
         cameras = [c.pinhole() for c in scene.calib]
         images = [load_frame(f, c, n) for n, (f, c) in enumerate(zip(scene.frames, scene.calib, strict=True))]
         points = sparse.find_points(images, cameras)
-        box = view_selection.target_box(cameras, points)
+        box = view_selection.search_box(cameras, points)
         ranges = view_selection.depth_ranges(cameras, points, box, config.sparse.range_stretch, False)
         sources = view_selection.choose_sources(view_selection.view_scores(cameras, points, box, config.depth), config.depth.sources)
         gray = [depth_stage.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]

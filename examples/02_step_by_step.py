@@ -25,7 +25,7 @@ def main(scene_path=SAMPLE, output="pickup.ply"):
     cameras = [c.pinhole() for c in scene.calib]
 
     points = sparse.find_points(images, cameras)
-    box = view_selection.target_box(cameras, points)
+    box = view_selection.search_box(cameras, points)
     ranges = view_selection.depth_ranges(cameras, points, box, stretch=0.25, bounded=False)
     sources = view_selection.choose_sources(view_selection.view_scores(cameras, points, box, DepthConfig()), 4)
 

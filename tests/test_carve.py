@@ -8,7 +8,7 @@ from mvcore import Config, InvalidInputError, ReconstructionError, _core
 from mvcore.config import CarveConfig, VolumeConfig
 from mvcore.evaluation.metrics import mesh_metrics
 from mvcore.mesh.surface import extract_surface, isosurface
-from mvcore.silhouettes.visual_hull import carve_silhouettes, shadow, supported, target_hull
+from mvcore.silhouettes.visual_hull import carve_silhouettes, shadow, supported, bounded_hull
 from mvcore.volume.photo_hull import dense, photo_hull, sparse_volume, visual_hull
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -66,7 +66,7 @@ def test_phantoms_that_few_views_see_are_left_out():
     # Two cameras side by side see a second place, beyond the others' pictures; nothing there speaks against a target.
     cameras = rig(8, (120, 90))
     masks = [(render_target(c, np.eye(4))[1] * 255).astype(np.uint8) for c in cameras]
-    hull = target_hull(masks, cameras, np.array([[-4.0, -4, -3], [4, 4, 3]]), CarveConfig())
+    hull = bounded_hull(masks, cameras, np.array([[-4.0, -4, -3], [4, 4, 3]]), CarveConfig())
     full = hull.origin + hull.voxel * np.argwhere(hull.occupied)
     assert (np.abs(full) < 1.0).all()
     assert shadow(hull, cameras[0]).any()
@@ -74,7 +74,7 @@ def test_phantoms_that_few_views_see_are_left_out():
 
 def test_more_views_than_votes_fit_into_a_byte(silhouettes):
     cameras, masks = silhouettes
-    few, many = (target_hull(masks * k, cameras * k, BOX, CarveConfig(resolution=32)) for k in (1, 25))
+    few, many = (bounded_hull(masks * k, cameras * k, BOX, CarveConfig(resolution=32)) for k in (1, 25))
     boxes = [h.origin + h.voxel * np.stack([np.argwhere(h.occupied).min(0), np.argwhere(h.occupied).max(0)]) for h in (few, many)]
     assert np.abs(boxes[0] - boxes[1]).max() < 2 * few.voxel
 

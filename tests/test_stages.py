@@ -38,7 +38,7 @@ from mvcore.silhouettes.occluder_repair import repaired_masks
 from mvcore.sparse.calibration_check import CalibrationError, calibration_error, check_calibration
 from mvcore.sparse.features import candidate_pairs, detect
 from mvcore.sparse.points import find_points, match_and_triangulate
-from mvcore.sparse.view_selection import choose_sources, depth_ranges, target_box, view_scores
+from mvcore.sparse.view_selection import choose_sources, depth_ranges, search_box, view_scores
 from mvcore.types import DepthMap, Report, SparsePoints
 from mvcore.volume.hull_prior import hull_share, silhouette_distance
 from mvcore.volume.tsdf import Volume, _Fusion, fuse, fuse_tiles
@@ -68,7 +68,7 @@ def test_points_ranges_and_box_of_a_ring(ring):
     assert np.median(np.abs(radius[radius < 1] - 0.5)) < 0.005
     assert surrounds(cameras)
     assert np.allclose(convergence(cameras), 0, atol=1e-6)
-    box = target_box(cameras, points)
+    box = search_box(cameras, points)
     assert (box[0] < -0.5).all()
     assert (box[1] > 0.5).all()
     for (near, far), depth in zip(depth_ranges(cameras, points, box, 0.25, False), depths):
@@ -122,7 +122,7 @@ def test_textureless_scenes_fall_back_to_the_common_volume(ring):
     report = Report()
     points = find_points(grey, cameras, report=report)
     assert len(points) == 0
-    box = target_box(cameras, points)
+    box = search_box(cameras, points)
     assert np.allclose(box, common_volume(cameras))
     assert "too few sure matches" in report.warnings[0]
 

@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mvcore import InvalidInputError, ReconstructionError
 from mvcore.cli.main import app
-from mvcore.config import TargetConfig, VolumeConfig
+from mvcore.config import BackgroundConfig, VolumeConfig
 from mvcore.geometry.registration import Cloud, find_poses
 from mvcore.io import load_video
 from mvcore.io.meshes import animated
@@ -413,7 +413,7 @@ def test_a_background_is_learnt_from_the_clip():
     camera = rig(1, (200, 150))[0]
     path = [turned(9 * t, (0.0, 0.9 - 0.15 * t, 0)) for t in range(13)]
     frames = [render_target(camera, p)[0] for p in path]
-    (learnt,) = learn_backgrounds([frames], [camera], config=TargetConfig())
+    (learnt,) = learn_backgrounds([frames], [camera], config=BackgroundConfig())
     plate, _ = render_target(camera)
     assert (np.abs(learnt.plate.astype(int) - plate).max(2) < 12)[learnt.known].mean() > 0.98
     (found,) = foreground([frames[6]], [camera], [learnt])

@@ -17,8 +17,8 @@ from mvcore.geometry.linear import solve, weighted_sum
 from mvcore.geometry.rig import box_depth, common_volume, surrounds
 from mvcore.mesh.surface import isosurface
 from mvcore.silhouettes.occluder_repair import repaired_masks
-from mvcore.silhouettes.visual_hull import target_hull
-from mvcore.sparse.view_selection import choose_sources, depth_ranges, nearest_angles, target_box, view_middles, view_scores
+from mvcore.silhouettes.visual_hull import bounded_hull
+from mvcore.sparse.view_selection import choose_sources, depth_ranges, nearest_angles, search_box, view_middles, view_scores
 from mvcore.types import DepthMap, SparsePoints
 from mvcore.volume.hull_prior import silhouette_distance
 from mvcore.volume.photo_hull import photo_hull, sparse_volume
@@ -71,7 +71,7 @@ def test_the_box_of_a_room_seen_from_inside_holds_its_walls(rig):
     depths = [room_depth(c) for c in cameras]
     points = points_of(cameras, depths)
     assert surrounds(cameras)
-    box = target_box(cameras, points)
+    box = search_box(cameras, points)
     assert (box[0] <= ROOM[0] + 0.05)[:2].all()
     assert (box[1] >= ROOM[1] - 0.05)[:2].all()
     assert (box[1] - box[0] < 1.6 * (ROOM[1] - ROOM[0])).all()
@@ -95,7 +95,7 @@ def test_cameras_that_look_inwards_keep_their_common_volume(ring):
     points = SparsePoints(
         np.concatenate([target.positions, far]), np.concatenate([target.visible, seen], 1), np.zeros(2 * len(far), np.float32)
     )
-    assert np.array_equal(target_box(cameras, points), common_volume(cameras))
+    assert np.array_equal(search_box(cameras, points), common_volume(cameras))
 
 
 def test_a_view_that_has_the_box_behind_it_serves_none():
@@ -128,8 +128,8 @@ def test_carving_takes_views_that_have_the_hull_behind_them(ring):
     outlines = [m.astype(np.uint8) for m in masks]
     box = np.array([[-0.8] * 3, [0.8] * 3])
     config = CarveConfig(resolution=48)
-    one = target_hull(outlines, cameras, box, config)
-    two = target_hull([*outlines, outlines[0]], [*cameras, away], box, config)
+    one = bounded_hull(outlines, cameras, box, config)
+    two = bounded_hull([*outlines, outlines[0]], [*cameras, away], box, config)
     assert two.occupied.sum() == pytest.approx(one.occupied.sum(), rel=0.05)
     field = np.where(np.linalg.norm(np.indices((32,) * 3) / 31 - 0.5, axis=0) < 0.4, -1, 1).astype(np.float32)
     hull = sparse_volume(field, np.full(3, -0.6), 1.2 / 31)

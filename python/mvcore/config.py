@@ -205,7 +205,7 @@ class VolumeConfig(Checked):
 
 
 @dataclass(frozen=True)
-class TargetConfig(Checked):
+class BackgroundConfig(Checked):
     """Foreground masks of a target in clips."""
 
     threshold: Annotated[float, within(0, 255, "grey levels")] = 12.0
@@ -355,7 +355,7 @@ class Config(Checked):
     sparse: SparseConfig = field(default_factory=SparseConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     volume: VolumeConfig = field(default_factory=VolumeConfig)
-    target: TargetConfig = field(default_factory=TargetConfig)
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
     carve: CarveConfig = field(default_factory=CarveConfig)
     standing: StandingConfig = field(default_factory=StandingConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)

@@ -60,7 +60,7 @@ def info(
     from ..io import load
     from ..io.images import load_frame, undistort
     from ..sparse.points import find_points
-    from ..sparse.view_selection import target_box
+    from ..sparse.view_selection import search_box
     from ..types import Report
 
     scene = load(path, images=True if images is None else images, allow_outside=allow_outside)
@@ -80,7 +80,7 @@ def info(
     error_px = report.values["calibration"]["median_epipolar_error_px"]
     fit = "unknown (too few matches)" if error_px is None else f"median epipolar error {error_px:.2f} px"
     print(f"calibration: {fit}; {len(points)} sparse points")
-    box = scene.bounds if scene.bounds is not None else target_box(cameras, points)
+    box = scene.bounds if scene.bounds is not None else search_box(cameras, points)
     print(f"target box: {box.round(4).tolist()}{' (given)' if scene.bounds is not None else ''}")
     shown().warn(report.warnings)
     shown().end()

@@ -108,7 +108,7 @@ def located(
     """Where the targets are, and their silhouettes where they are found against a background rather than given."""
     found = None
     if learnt is not None:
-        found = task(stages.silhouettes, views, learnt, cameras, box, config.target, config.carve)
+        found = task(stages.silhouettes, views, learnt, cameras, box, config.background, config.carve)
     return task(stages.locate, views, found, cameras, box, bounds, config.carve, config.video.least_target, config.video.margin), found
 
 

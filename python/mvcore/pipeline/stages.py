@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import _core
-from ..config import CarveConfig, DepthConfig, SparseConfig, StandingConfig, SurfaceConfig, TargetConfig, TextureConfig, VolumeConfig
+from ..config import CarveConfig, DepthConfig, SparseConfig, StandingConfig, SurfaceConfig, BackgroundConfig, TextureConfig, VolumeConfig
 from ..depth import RoughDepth, View, filter_depth, guided_depth, network_depth, refine_depth, seeded_depth, sweep_depth
 from ..errors import ReconstructionError
 from ..geometry.cameras import Camera
@@ -24,7 +24,7 @@ from ..mesh.surface import Surface, cleaned, drop_cavities, drop_unseen, isosurf
 from ..mesh.texture import TexturePrior, texture
 from ..silhouettes.background_subtraction import Background, foreground, learn_backgrounds
 from ..silhouettes.object_segmentation import Standing, find_standing
-from ..silhouettes.visual_hull import shadow, target_hull
+from ..silhouettes.visual_hull import shadow, bounded_hull
 from ..sparse import view_selection
 from ..sparse.calibration_check import calibration_error, check_calibration
 from ..sparse.features import Features, candidate_pairs, detect
@@ -110,7 +110,7 @@ def survey(found: Sequence[Features], cameras: Sequence[Camera], bounds: Bounds 
         "points": len(points),
         "mean_error_px": float(points.errors.mean()) if len(points) else None,
     }
-    box = bounds if bounds is not None else view_selection.target_box(cameras, points)
+    box = bounds if bounds is not None else view_selection.search_box(cameras, points)
     return Survey(points, np.asarray(box, np.float64), Findings.of(report))
 
 
@@ -118,7 +118,7 @@ def survey(found: Sequence[Features], cameras: Sequence[Camera], bounds: Bounds 
 
 
 def backgrounds(
-    samples: Sequence[Pixels], counts: Sequence[int], cameras: Sequence[Camera], box: Bounds, config: TargetConfig, carving: CarveConfig
+    samples: Sequence[Pixels], counts: Sequence[int], cameras: Sequence[Camera], box: Bounds, config: BackgroundConfig, carving: CarveConfig
 ) -> list[Background]:
     """What stands behind the target, learnt from ``counts[n]`` samples of each camera, one camera after the other."""
     ends = np.cumsum(counts)
@@ -146,7 +146,7 @@ def silhouettes(
     learnt: Sequence[Background],
     cameras: Sequence[Camera],
     box: Bounds,
-    config: TargetConfig,
+    config: BackgroundConfig,
     carving: CarveConfig,
 ) -> list[Mask]:
     """The target's masks at one frame, by background subtraction."""
@@ -185,7 +185,7 @@ def locate(
     """
     every = list(_Masks(views)) if masks is None else list(masks)
     findings = Findings(warnings=mask_warnings(every) if masks is None else [])
-    hull = target_hull(every, cameras, box, carving)
+    hull = bounded_hull(every, cameras, box, carving)
     parts, hulls = find_targets(hull, every, cameras, least)
     if not parts:
         return Target([], hulls, box, [], findings)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import CarveConfig, TargetConfig
+from ..config import CarveConfig, BackgroundConfig
 from ..errors import require
 from ..geometry.cameras import Camera
 from ..io.images import reduce
@@ -54,7 +54,7 @@ class _Evidence:
     background: Bool
 
 
-def _evidence(image: Image, background: Background, config: TargetConfig) -> _Evidence:
+def _evidence(image: Image, background: Background, config: BackgroundConfig) -> _Evidence:
     """Compares a frame with the plate; light and shadow change a surface's brightness but not its pattern.
 
     Where the plate or the frame has a pattern, correlation of logarithms over a window tells a shadow from a thing; elsewhere the usual
@@ -86,7 +86,7 @@ def _evidence(image: Image, background: Background, config: TargetConfig) -> _Ev
     return _Evidence(((difference > least) & ~relit | ~background.known) & background.region, sure & background.known | ~background.region)
 
 
-def _cleaned(mask: Mask, config: TargetConfig) -> Mask:
+def _cleaned(mask: Mask, config: BackgroundConfig) -> Mask:
     """Without specks, closed, parts of some size only."""
     mask = cv2.morphologyEx(cv2.medianBlur(mask, 5), cv2.MORPH_OPEN, _disc(3))
     return large_parts(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(9)), config.least_part)
@@ -170,7 +170,7 @@ def foreground(
     cameras: Sequence[Camera],
     backgrounds: Sequence[Background],
     bounds: Bounds | None = None,
-    config: TargetConfig | None = None,
+    config: BackgroundConfig | None = None,
     carving: CarveConfig | None = None,
 ) -> list[Mask]:
     """The target's masks at one instant.
@@ -184,7 +184,7 @@ def foreground(
     -------
     (h, w) uint8 of 0 and 255, one a camera.
     """
-    config, carving = config or TargetConfig(), carving or CarveConfig()
+    config, carving = config or BackgroundConfig(), carving or CarveConfig()
     require(len(images) == len(cameras) == len(backgrounds), "backgrounds", f"{len(images)}, one an image", len(backgrounds))
     small, reduced, found, unknown = [], [], [], []
     for n, (image, camera) in enumerate(zip(images, cameras, strict=True)):
@@ -222,7 +222,7 @@ def learn_backgrounds(
     frames: Sequence[Sequence[Image]],
     cameras: Sequence[Camera],
     bounds: Bounds | None = None,
-    config: TargetConfig | None = None,
+    config: BackgroundConfig | None = None,
     carving: CarveConfig | None = None,
     track: Track = no_track,
 ) -> list[Background]:
@@ -241,7 +241,7 @@ def learn_backgrounds(
     -------
     One a camera, with the longer side at most ``config.max_size`` pixels.
     """
-    config, carving = config or TargetConfig(), carving or CarveConfig()
+    config, carving = config or BackgroundConfig(), carving or CarveConfig()
     require(all(len(f) >= 3 for f in frames), "frames", "at least 3 samples a camera", min(map(len, frames)))
     plates, regions, ghosts, still, usual, reduced = [], [], [], [], [], []
     for samples, camera in track(zip(frames, cameras, strict=True), "background", len(cameras)):
@@ -275,7 +275,7 @@ def _uncovered(
     cameras: Sequence[Camera],
     backgrounds: Sequence[Background],
     bounds: Bounds,
-    config: TargetConfig,
+    config: BackgroundConfig,
     carving: CarveConfig,
 ) -> list[Background]:
     """Backgrounds with what is seen behind the target at the samples at which, as the other cameras have it, it is elsewhere."""
@@ -303,7 +303,7 @@ LEAST_SAMPLES = 3
 """Samples that must show a place without the target before its background counts as known."""
 
 
-def _commonest(samples: NDArray[np.uint8], config: TargetConfig, valid: Bool | None = None) -> Image:
+def _commonest(samples: NDArray[np.uint8], config: BackgroundConfig, valid: Bool | None = None) -> Image:
     """The colour of each pixel that the most samples are near to: their mean. Samples that are not ``valid`` there do not count."""
     plate = np.empty(samples.shape[1:], np.uint8)
     for y in range(len(plate)):  # a row at a time: all pairs of samples would be large
@@ -318,7 +318,7 @@ def _commonest(samples: NDArray[np.uint8], config: TargetConfig, valid: Bool | N
     return plate
 
 
-def _moving(samples: NDArray[np.uint8], config: TargetConfig) -> Mask:
+def _moving(samples: NDArray[np.uint8], config: BackgroundConfig) -> Mask:
     """Where the target is at some time: what changes over the samples, closed and filled; 0 and 1."""
     smooth = np.stack([cv2.GaussianBlur(s, (0, 0), 1.2) for s in samples])
     low, high = np.quantile(smooth, [0.04, 0.96], axis=0)
@@ -339,7 +339,7 @@ def _widened(region: Mask) -> Mask:
     return cv2.dilate(region, _disc(2 * round(0.03 * max(region.shape)) + 1))
 
 
-def _ghost(samples: NDArray[np.uint8], plate: Image, region: Mask, config: TargetConfig) -> Mask:
+def _ghost(samples: NDArray[np.uint8], plate: Image, region: Mask, config: BackgroundConfig) -> Mask:
     """Where the plate shows the target, 0 and 1: by the colours of what differs from it in the samples."""
     wide = _widened(region)
     chosen = samples[:: max(1, len(samples) // GHOST_SAMPLES)]

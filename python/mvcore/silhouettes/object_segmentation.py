@@ -19,7 +19,7 @@ from ..config import CarveConfig, StandingConfig
 from ..geometry.cameras import Camera
 from ..io.images import reduce
 from ..types import Bounds, DepthMap, Image, Report
-from .visual_hull import MOST_VIEWS, Occupancy, at_most, carve_silhouettes, large_parts, shadow, target_hull
+from .visual_hull import MOST_VIEWS, Occupancy, at_most, carve_silhouettes, large_parts, shadow, bounded_hull
 
 Mask = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
@@ -303,7 +303,7 @@ def _common_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bound
     """The hull of the views that show something; empty where they have nothing in common."""
     seen = [n for n, m in enumerate(masks) if m.any()]
     masks, cameras = at_most(MOST_VIEWS, [masks[n] for n in seen], [cameras[n] for n in seen])
-    around = target_hull(masks, cameras, bounds, config)
+    around = bounded_hull(masks, cameras, bounds, config)
     if not around.occupied.any():
         return around
     return carve_silhouettes(masks, cameras, around.box(), tolerance=0.5 * config.tolerance)

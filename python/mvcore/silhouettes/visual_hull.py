@@ -135,7 +135,7 @@ EXPLAINED = 0.97
 """Share of what the fullest hull shows of the masks that a smaller one must show."""
 
 
-def target_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Occupancy:
+def bounded_hull(masks: Sequence[Mask], cameras: Sequence[Camera], bounds: Bounds, config: CarveConfig) -> Occupancy:
     """The hull in a box of its own, without the phantoms that few views cannot rule out.
 
     Near few cameras, or outside most pictures, hardly anything speaks against a voxel. So as many cameras must see a voxel as the
@@ -194,7 +194,7 @@ def supported(
     All but the share ``tolerance`` of those that see it must, and at least ``least_views`` must see it. Foreground elsewhere is noise.
     Where the others have nothing in common, these are all pixels.
     """
-    hull = target_hull(masks, cameras, bounds, config)
+    hull = bounded_hull(masks, cameras, bounds, config)
     box = np.asarray(bounds, np.float64)
     if hull.occupied.any():
         box = hull.box(2.0)

@@ -39,7 +39,7 @@ def _inside(points: Float, box: Bounds) -> NDArray[np.bool_]:
     return np.asarray(((points >= box[0]) & (points <= box[1])).all(1))
 
 
-def target_box(cameras: Sequence[Camera], points: SparsePoints) -> Bounds:
+def search_box(cameras: Sequence[Camera], points: SparsePoints) -> Bounds:
     """Box of the target, (2, 3).
 
     Cameras that look inwards at what their points lie on: the volume that most of them see, so that the background drops out. Cameras on

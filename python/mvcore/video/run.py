@@ -201,7 +201,7 @@ class ClipRun:
 
     def _learnt_plates(self, run: Run, missing: list[int], box: Bounds) -> Task[list[Background]]:
         """From samples of the whole clips, whatever part is reconstructed."""
-        job, config = self.job, self.job.config.target
+        job, config = self.job, self.job.config.background
         line = job.clips.timeline
         chosen = line[sorted({int(n) for n in np.linspace(0, len(line) - 1, min(len(line), config.samples)).round()})]
         require(len(chosen) >= 3, "background", "a clean plate of every camera, or at least 3 frames to learn it from", len(chosen))

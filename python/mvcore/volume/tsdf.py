@@ -58,7 +58,7 @@ def _depths_inside(camera: Camera, view: DepthMap, bounds: Bounds) -> NDArray[np
     return np.asarray(z[((points >= bounds[0]) & (points <= bounds[1])).all(1)])
 
 
-def target_voxel(cameras: Sequence[Camera], depths: Sequence[DepthMap], bounds: Bounds, config: VolumeConfig) -> float:
+def voxel_size(cameras: Sequence[Camera], depths: Sequence[DepthMap], bounds: Bounds, config: VolumeConfig) -> float:
     """Voxel size in world units: ``config.footprints`` median pixel footprints (depth over focal length) inside the bounds."""
     return _voxel(cameras, [_depths_inside(c, d, bounds) for c, d in zip(cameras, depths, strict=True)], bounds, config)
 

@@ -19,7 +19,7 @@ FOCAL = 1.5
 """In image widths."""
 
 
-class Target:
+class TrainingObject:
     """A body of three to six textured shapes; equal for equal ``seed`` and ``held_out`` (the families it is made of)."""
 
     def __init__(self, seed: int, held_out: bool) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ...io.files import atomically
-from ..procedural.objects import Target
+from ..procedural.objects import TrainingObject
 from ..recognition import TargetClassifier, rank_1, squared_error
 from ..weights import save_weights
 from .logs import cut_log, log_row
@@ -43,7 +43,7 @@ def picture_stock(classes: int, pictures: int, seed: int) -> NDArray[np.uint8]:
     random = np.random.default_rng((seed, 5))
     stock = []
     for n in range(classes):
-        target = Target(seed * 100_003 + n, False)
+        target = TrainingObject(seed * 100_003 + n, False)
         sides = zip(random.uniform(-1.22, 1.22, pictures), random.uniform(0, 0.6, pictures), strict=True)
         stock.append([target.photograph(a, e, random) for a, e in sides])
     return np.array(stock, np.uint8)
@@ -52,7 +52,7 @@ def picture_stock(classes: int, pictures: int, seed: int) -> NDArray[np.uint8]:
 def validate_recognition(net: TargetClassifier, targets: int = 100, seed: int = 9) -> dict[str, float]:
     """Rank-1 of held-out targets across angles: gallery from the front, probes turned by 30 and 60 degrees; and what chance gives."""
     random = np.random.default_rng((seed, 6))
-    bodies = [Target(seed * 7919 + n, True) for n in range(targets)]
+    bodies = [TrainingObject(seed * 7919 + n, True) for n in range(targets)]
     gallery = net.embed([b.photograph(0.0, 0.3, random) for b in bodies])
     figures = {"chance": 1 / targets}
     for angle in ANGLES:
