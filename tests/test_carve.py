@@ -8,7 +8,7 @@ from mvcore import Config, InvalidInputError, ReconstructionError, _core
 from mvcore.config import CarveConfig, VolumeConfig
 from mvcore.evaluation.metrics import mesh_metrics
 from mvcore.mesh.surface import extract_surface, isosurface
-from mvcore.silhouettes.visual_hull import carve_silhouettes, shadow, supported, bounded_hull
+from mvcore.silhouettes.visual_hull import bounded_hull, carve_silhouettes, shadow, supported
 from mvcore.volume.photo_hull import dense, photo_hull, sparse_volume, visual_hull
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])

@@ -16,7 +16,7 @@ from mvcore.network.cost import correlate, cost_space, scaled_maps, unit
 from mvcore.network.folding import folded, unfolded
 from mvcore.network.matcher import MOST_SEEN, Matcher, padded
 from mvcore.network.model import DisparityNet
-from mvcore.network.procedural.objects import SIZE, Target
+from mvcore.network.procedural.objects import SIZE, TrainingObject
 from mvcore.network.recognition import SHIPPED, TargetClassifier, load_classifier, rank_1, squared_error
 from mvcore.network.training.batches import Recipe, make_batch
 from mvcore.network.training.datasets import LAYOUTS, cropped, find_items
@@ -200,7 +200,7 @@ def test_network_disparity_fills_or_leaves_out_what_is_hidden():
 
 def test_a_target_is_the_same_from_its_seed_and_differs_from_others():
     def shot(seed, angle):
-        return Target(seed, False).photograph(angle, 0.2, np.random.default_rng(0)).astype(int)
+        return TrainingObject(seed, False).photograph(angle, 0.2, np.random.default_rng(0)).astype(int)
 
     assert np.array_equal(shot(3, 0.5), shot(3, 0.5))
     assert shot(3, 0.5).shape == (SIZE, SIZE, 3)

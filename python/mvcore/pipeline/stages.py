@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import _core
-from ..config import CarveConfig, DepthConfig, SparseConfig, StandingConfig, SurfaceConfig, BackgroundConfig, TextureConfig, VolumeConfig
+from ..config import BackgroundConfig, CarveConfig, DepthConfig, SparseConfig, StandingConfig, SurfaceConfig, TextureConfig, VolumeConfig
 from ..depth import RoughDepth, View, filter_depth, guided_depth, network_depth, refine_depth, seeded_depth, sweep_depth
 from ..errors import ReconstructionError
 from ..geometry.cameras import Camera
@@ -24,7 +24,7 @@ from ..mesh.surface import Surface, cleaned, drop_cavities, drop_unseen, isosurf
 from ..mesh.texture import TexturePrior, texture
 from ..silhouettes.background_subtraction import Background, foreground, learn_backgrounds
 from ..silhouettes.object_segmentation import Standing, find_standing
-from ..silhouettes.visual_hull import shadow, bounded_hull
+from ..silhouettes.visual_hull import bounded_hull, shadow
 from ..sparse import view_selection
 from ..sparse.calibration_check import calibration_error, check_calibration
 from ..sparse.features import Features, candidate_pairs, detect

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import CarveConfig, BackgroundConfig
+from ..config import BackgroundConfig, CarveConfig
 from ..errors import require
 from ..geometry.cameras import Camera
 from ..io.images import reduce

@@ -19,7 +19,7 @@ from ..config import CarveConfig, StandingConfig
 from ..geometry.cameras import Camera
 from ..io.images import reduce
 from ..types import Bounds, DepthMap, Image, Report
-from .visual_hull import MOST_VIEWS, Occupancy, at_most, carve_silhouettes, large_parts, shadow, bounded_hull
+from .visual_hull import MOST_VIEWS, Occupancy, at_most, bounded_hull, carve_silhouettes, large_parts, shadow
 
 Mask = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
