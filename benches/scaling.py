@@ -101,7 +101,8 @@ def main() -> None:
             line += f", exponent {np.log(done['cpu'] / before[1]) / np.log(ratio):.2f}"
             for stage, spent in done["seconds"].items():
                 if spent["cpu"] > 0.02 * done["cpu"] and stage in before[2]:
-                    line += f"\n      {stage}: {spent['cpu']:.1f} CPU s, exponent {np.log(spent['cpu'] / before[2][stage]['cpu']) / np.log(ratio):.2f}"
+                    exponent = np.log(spent["cpu"] / before[2][stage]["cpu"]) / np.log(ratio)
+                    line += f"\n      {stage}: {spent['cpu']:.1f} CPU s, exponent {exponent:.2f}"
         print(line, flush=True)
         before = (views, done["cpu"], done["seconds"])
 
