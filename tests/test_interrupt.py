@@ -50,10 +50,11 @@ KERNELS = {
     """,
 }
 SCRIPT = """
-import sys, time
+import signal, sys, time
 import numpy as np
 from mvcore import _core
 rng = np.random.default_rng(0)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background inherit that it is ignored
 def start():
     print("start", flush=True)
 try:
