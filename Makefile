@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Of each half of `make fuzz`.
 SECONDS ?= 120
 
-.PHONY: help demo test build lint rust-test rust-test-debug python-test fuzz bench peers format clean
+.PHONY: help demo test build lint rust-test rust-test-debug python-test fuzz bench peers train-gpu format clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / — /'
@@ -53,6 +53,13 @@ peers: build ## each kernel beside what a user would pick instead
 	$(BIN)/pip install --quiet '.[peers]'
 	$(BIN)/python benches/peers.py
 	$(BIN)/python benches/nurbs_peers.py
+
+MINUTES ?= 12
+OUT ?= out/train-gpu
+train-gpu: ## train the disparity network further on one GPU, for MINUTES, into OUT: weights, log, figures
+	$(BIN)/python -m mvcore.cli.main train disparity --device cuda --start python/mvcore/network/disparity.safetensors \
+		--batch 16 --size 320x256 --rate 1e-3 --steps 100000 --every 600 --seed 3 --replay 4096 \
+		--workers $$(($$(nproc) - 1)) --hours $$(awk 'BEGIN { print $(MINUTES) / 60 }') --out $(OUT)
 
 format: build ## rewrite the sources in the project's format
 	cargo fmt --all

@@ -30,7 +30,8 @@ from mvcore.io.images import load_frame
 from mvcore.network import matcher as match
 from mvcore.network.matcher import SHIPPED, Matcher, planes_for, shipped_matcher
 from mvcore.network.training.batches import Recipe, make_batch
-from mvcore.network.training.train_disparity import Training, train_disparity, validate
+from mvcore.network.training.train_disparity import Training, train_disparity
+from mvcore.network.training.validation import HeldOut, validate
 from mvcore.network.weights import load_disparity
 from mvcore.sparse import points as sparse
 from mvcore.sparse import view_selection
@@ -70,7 +71,8 @@ def size(arguments):
 
 def heldout(arguments):
     net = load_disparity(arguments.weights)
-    print({k: round(v, 4) for k, v in validate(net, Recipe().seed, torch.device("cpu"), 40).items()})
+    sets = HeldOut(Recipe().seed, arguments.count or 200).sets
+    print({k: round(v, 4) for k, v in validate(net, sets["report"], torch.device("cpu")).items()})
     errors = {m: [] for m in MATCHERS}
     for n in range(20):
         for left, right, true, most in _pairs_of(make_batch(Recipe(seed=Recipe().seed + 1_000_000, held_out=True, pairs=1.0), n)):
@@ -160,7 +162,7 @@ def views(arguments):
         gray = [depth_stage.View(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), c, i) for i, c in zip(images, cameras, strict=True)]
         scale = json.loads((folder / "cameras.json").read_text())["depth_scale"]
         shares = {"network alone": [], "dcnn": [], "sgm": []}
-        for n in np.unique(np.linspace(0, len(images) - 1, arguments.count).astype(int)):
+        for n in np.unique(np.linspace(0, len(images) - 1, arguments.count or 4).astype(int)):
             truth = _truth(folder, scene.frames[n], "depth").astype(np.float32) * scale
             mask = _truth(folder, scene.frames[n], "masks") > 0
             near = [gray[j] for j in sources[n]]
@@ -225,12 +227,13 @@ VARIANTS = {
 def ablation(arguments):
     steps = int(str(arguments.folders[0])) if arguments.folders else 300
     print(f"{steps} steps each; on held-out families: shares of pixels off by more than a plane, mean error in px")
+    held = HeldOut(Recipe().seed, 40).sets["report"]
     for name, (build, data) in VARIANTS.items():
         with tempfile.TemporaryDirectory() as folder:
             training = Training(steps=steps, every=steps, warmup=20, averaging=0.98, recipe=Recipe(width=160, height=112, **data), **build)
             train_disparity(training, Path(folder), report=lambda _: None)
             net = load_disparity(Path(folder) / "best.safetensors")
-        figures = validate(net, Recipe().seed, torch.device("cpu"), 10)
+        figures = validate(net, held, torch.device("cpu"))
         print(f"  {name:20s}" + "".join(f"  {k} {v:.3f}" for k, v in figures.items()), flush=True)
 
 
@@ -240,7 +243,7 @@ def main():
     parser.add_argument("job", choices=jobs)
     parser.add_argument("folders", type=Path, nargs="*")
     parser.add_argument("--weights", type=Path, default=SHIPPED)
-    parser.add_argument("--count", type=int, default=4, help="views of each scene")
+    parser.add_argument("--count", type=int, help="views of each scene (4), or held-out samples (200)")
     arguments = parser.parse_args()
     match.SHIPPED = arguments.weights
     jobs[arguments.job](arguments)

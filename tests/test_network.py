@@ -1,6 +1,8 @@
 """The network's parts: geometry of the cost space, gradients, the procedural truth, training, weights."""
 
 import csv
+import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +12,15 @@ from mvcore.errors import FormatError, InvalidInputError
 from mvcore.geometry.cameras import relative_map
 from mvcore.network.cost import correlate, landing, scaled_maps, unit
 from mvcore.network.features import PRESETS, Trunk, load_vgg16
+from mvcore.network.folding import renormalised
 from mvcore.network.matcher import SHIPPED
 from mvcore.network.model import DisparityNet
 from mvcore.network.procedural.scenes import Tiles, random_pair, random_views
 from mvcore.network.regularise import soft_argmin, windowed_soft_argmin
 from mvcore.network.training.batches import Recipe, make_batch
-from mvcore.network.training.losses import loss
-from mvcore.network.training.train_disparity import Training, _rate, train_disparity
+from mvcore.network.training.losses import HIDDEN_SHARE, loss, split_loss
+from mvcore.network.training.stream import Stock, _Tasks, mirrored
+from mvcore.network.training.train_disparity import Training, _rate, _Run, train_disparity
 from mvcore.network.weights import load_disparity, save_weights
 
 SMALL = Recipe(width=64, height=48)
@@ -96,15 +100,108 @@ def test_twenty_steps_lower_the_loss():
     for _ in range(20):
         optimiser.zero_grad()
         out = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, 24)
-        value = loss(out, batch.inverse, batch.low, batch.high)
+        value = loss(out, batch.inverse, batch.low, batch.high, batch.seen)
         value.backward()
         optimiser.step()
         values.append(float(value.detach()))
     assert np.mean(values[-3:]) < 0.7 * np.mean(values[:3])
 
 
+def test_hidden_pixels_count_apart_from_seen_ones():
+    """What the loss says of the seen pixels does not change with the truth of the hidden ones, nor the other way round."""
+    torch.manual_seed(0)
+    batch = make_batch(replace(SMALL, pairs=1.0), 0)
+    out = DisparityNet().train()(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, 24)
+    hidden = ~batch.seen.any(1) & (batch.inverse > 0)
+    assert 0.02 < hidden.float().mean() < 0.9
+    middle = ((batch.low + batch.high) / 2)[:, None, None].expand_as(batch.inverse)
+    true, moved, unknown = (
+        split_loss(out, i, batch.low, batch.high, batch.seen)
+        for i in (batch.inverse, torch.where(hidden, middle, batch.inverse), torch.where(hidden, 0, batch.inverse))
+    )
+    assert moved[0] == true[0]
+    assert moved[1] != true[1]
+    assert (unknown[0], unknown[1]) == (true[0], 0)
+    whole = loss(out, batch.inverse, batch.low, batch.high, batch.seen)
+    assert whole.item() == pytest.approx(((1 - HIDDEN_SHARE) * true[0] + HIDDEN_SHARE * true[1]).item())
+
+
+@pytest.mark.parametrize("axis", [-1, -2])
+def test_a_mirrored_batch_lands_in_mirrored_places(axis):
+    batch = make_batch(replace(SMALL, pairs=0.0), 0)
+    turned = mirrored(batch, axis)
+    row, side = -1 - axis, batch.inverse.shape[axis]
+    before = landing(batch.maps[0], batch.inverse[:, None])[row]
+    after = landing(turned.maps[0], turned.inverse[:, None])[row].flip(axis)
+    good = (before.abs() < 1e3) & (after.abs() < 1e3)
+    assert good.float().mean() > 0.9
+    assert torch.allclose(after[good], side - 1 - before[good], atol=0.05)
+    assert torch.equal(mirrored(turned, axis).images[1], batch.images[1])
+
+
+def test_a_stock_keeps_the_latest_samples_and_draws_the_true_ones():
+    batches = [make_batch(replace(SMALL, pairs=1.0, batch=4), n) for n in range(3)]
+    stock = Stock(8, torch.device("cpu"), 0)
+    for batch in batches:
+        stock.add(batch)
+    drawn = [stock.draw(6, 24) for _ in range(4)]
+    latest = torch.cat([b.inverse for b in batches[1:]])
+    for batch in drawn:
+        assert batch.planes == 24
+        assert batch.seen.shape == (6, 1, 48, 64)
+        for truth in batch.inverse:
+            assert any(torch.equal(truth, k) or torch.equal(truth.flip(0), k) for k in latest)
+
+
+def test_what_a_rendering_process_is_told_fits_a_pipe():
+    """With more, each process would start only when the one before it had imported torch."""
+    tasks = _Tasks([(SMALL, range(3, 10)), (replace(SMALL, seed=2), range(100_000))])
+    assert len(pickle.dumps(tasks)) < 4096
+    assert len(tasks) == 100_007
+    assert torch.equal(tasks[9].inverse, make_batch(replace(SMALL, seed=2), 2).inverse)
+
+
+def test_a_training_that_replays_goes_on_after_a_stop(tmp_path):
+    training = Training(steps=4, every=2, workers=0, replay=8, validation=4, recipe=replace(SMALL, every=True))
+    train_disparity(training, tmp_path, report=lambda _: None, stop_after=2)
+    assert not (tmp_path / "report.json").exists()
+    train_disparity(training, tmp_path, report=lambda _: None)
+    with (tmp_path / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(r["step"]) for r in rows] == [2, 4]
+    assert all(float(r["loss_seen"]) > 0 and float(r["loss_hidden"]) > 0 for r in rows)
+    assert set(json.loads((tmp_path / "report.json").read_text())) == {"best"}
+
+
+def test_a_step_without_a_finite_gradient_leaves_the_weights(tmp_path):
+    run = _Run(Training(steps=4, recipe=SMALL), tmp_path, torch.device("cpu"))
+    batch = make_batch(SMALL, 0)
+    before = {k: v.clone() for k, v in run.net.named_parameters()}
+    run.train_on(replace(batch, images=[torch.full_like(i, float("nan"), dtype=torch.float32) for i in batch.images]))
+    assert run.sums.tolist() == [0, 0, 1]
+    assert all(torch.equal(before[k], v) for k, v in run.net.named_parameters())
+
+
+def test_renormalised_weights_compute_the_same(tmp_path):
+    """And their normalisations hold the statistics of the inputs, also where folding had left the identity."""
+    net, batch = load_disparity(SHIPPED), make_batch(SMALL, 0)
+    arguments = (batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, batch.planes)
+    with torch.no_grad():
+        before = net(*arguments).inverse
+        renormalised(net, [arguments])
+        as_batch = net.eval()(*arguments).inverse
+    span = (batch.high - batch.low)[:, None, None]
+    assert ((before - as_batch).abs() / span).median() < 1e-4
+    means = []
+    norm = net.coarse.enter[0][1]
+    norm.register_forward_hook(lambda m, i, _: means.append((i[0].mean((0, 2, 3, 4)) - m.running_mean).abs().max()))
+    with torch.no_grad():
+        net(*arguments)
+    assert means[0] < 0.05
+
+
 def test_a_killed_training_goes_on_to_the_same_weights(tmp_path):
-    training = Training(steps=4, every=2, workers=0, recipe=SMALL)
+    training = Training(steps=4, every=2, workers=0, validation=4, recipe=SMALL)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train_disparity(training, straight, report=lambda _: None)
     train_disparity(training, broken, report=lambda _: None, stop_after=2)
@@ -119,7 +216,7 @@ def test_training_begins_from_given_weights(tmp_path):
     torch.manual_seed(7)
     net = DisparityNet()
     save_weights(net, tmp_path / "start.safetensors")
-    training = Training(steps=1, every=1, rate=1e-9, workers=0, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
+    training = Training(steps=1, every=1, rate=1e-9, workers=0, validation=4, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
     train_disparity(training, tmp_path / "run", report=lambda _: None)
     after = torch.load(tmp_path / "run" / "last.pt", weights_only=True)["net"]
     assert torch.allclose(after["gain"], net.gain, atol=1e-3)
@@ -135,7 +232,8 @@ def test_frozen_statistics_stay_and_the_weights_are_those_of_the_usual_build(tmp
             module.running_mean.normal_(0, 0.1)
             module.running_var.uniform_(0.5, 1.5)
     save_weights(net, tmp_path / "start.safetensors")
-    training = Training(2, every=2, rate=1e-9, workers=0, freeze_norms=True, recipe=SMALL, start=str(tmp_path / "start.safetensors"))
+    begun = str(tmp_path / "start.safetensors")
+    training = Training(2, every=2, rate=1e-9, workers=0, freeze_norms=True, validation=4, recipe=SMALL, start=begun)
     best = train_disparity(training, tmp_path / "run", report=lambda _: None)
     with pytest.raises(InvalidInputError, match="freeze_norms: expected True, as the run in"):
         train_disparity(replace(training, freeze_norms=False), tmp_path / "run", report=lambda _: None)
@@ -153,7 +251,7 @@ def test_bfloat16_leaves_the_gradients_of_the_second_stage_as_they_are():
         out = net(batch.images[0], batch.images[1:], batch.maps, batch.low, batch.high, 32)
         assert out.coarse_scores[0].dtype == (torch.bfloat16 if net.bfloat16 else torch.float32)
         assert out.fine_scores[0].dtype == torch.float32
-        loss(out, batch.inverse, batch.low, batch.high).backward()
+        loss(out, batch.inverse, batch.low, batch.high, batch.seen).backward()
         gradients.append(torch.cat([p.grad.flatten() for p in net.fine.parameters()]))
     assert torch.isfinite(gradients[1]).all()
     assert torch.nn.functional.cosine_similarity(*gradients, dim=0) > 0.95

@@ -56,6 +56,8 @@ def train_disparity_network(
     bfloat16: Annotated[bool | None, typer.Option(help="Most of the work in that precision; by default on CUDA.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Batches between checkpoints.")] = 250,
     seed: Annotated[int, typer.Option(help="Of the scenes.")] = 1,
+    replay: Annotated[int, typer.Option(min=0, help="Samples kept on the device to draw from: no step waits for rendering.")] = 0,
+    validation: Annotated[int, typer.Option(min=4, help="Samples in each of the two held-out sets.")] = 200,
 ) -> None:
     """Train the disparity network on procedural scenes, and on published sets where given."""
     from ..network.features import PRESETS
@@ -69,7 +71,7 @@ def train_disparity_network(
     for source in data or ():
         print(f"{source}: {len(find_items(source))} samples")
     width, height = _sides(size)
-    recipe = Recipe(seed, batch, width, height, data=tuple(data or ()))
+    recipe = Recipe(seed, batch, width, height, every=replay > 0, data=tuple(data or ()))
     pairs = str(middlebury) if middlebury else None
     begun = str(start) if start else None
     training = Training(
@@ -81,6 +83,8 @@ def train_disparity_network(
         workers=workers,
         bfloat16=bfloat16,
         freeze_norms=freeze_norms,
+        replay=replay,
+        validation=validation,
         recipe=recipe,
         middlebury=pairs,
         start=begun,

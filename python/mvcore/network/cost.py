@@ -13,8 +13,9 @@ def scaled_maps(maps: Tensor, factor: int) -> Tensor:
     """Relative maps (…, 12) between views for images reduced by ``factor``, whose pixels cover factor² of the full ones."""
     a, b = maps[..., :9].unflatten(-1, (3, 3)), maps[..., 9:]
     shrink = torch.tensor([[1 / factor, 0, (1 - factor) / 2 / factor], [0, 1 / factor, (1 - factor) / 2 / factor], [0, 0, 1]])
-    shrink = shrink.to(maps)
-    return torch.cat([(shrink @ a @ torch.linalg.inv(shrink)).flatten(-2), b @ shrink.T], -1)
+    grow = torch.tensor([[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1]])
+    shrink, grow = shrink.to(maps), grow.to(maps)
+    return torch.cat([(shrink @ a @ grow).flatten(-2), b @ shrink.T], -1)
 
 
 def landing(maps: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:

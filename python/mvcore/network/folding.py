@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from .model import DisparityNet
@@ -34,6 +35,37 @@ def unfolded(net: DisparityNet) -> DisparityNet:
             norm.weight.fill_(1)
             norm.bias.copy_(conv.bias)
     return usual
+
+
+@torch.no_grad()
+def renormalised(net: DisparityNet, batches: Iterable[tuple[Any, ...]]) -> DisparityNet:
+    """The same function, in place, whose batch normalisations hold the statistics of these inputs and scale what they normalise back.
+
+    Training with the batches' own statistics can go on from there. From weights that were folded, whose normalisations are the identity, it
+    would begin with another function. ``batches`` are arguments of the network.
+    """
+    sums: dict[nn.Module, list[Tensor]] = {}
+
+    def gather(norm: nn.Module, inputs: tuple[Tensor, ...], _output: Tensor) -> None:
+        x = inputs[0].float()
+        sums.setdefault(norm, []).append(torch.stack([x.mean((0, 2, 3, 4)), x.square().mean((0, 2, 3, 4))]))
+
+    # In training all output modules run; their normalisations stay as they are meanwhile.
+    net.train()
+    norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm3d)]
+    hooks = [norm.eval().register_forward_hook(gather) for norm in norms]
+    for arguments in batches:
+        net(*arguments)
+    for norm, hook in zip(norms, hooks, strict=True):
+        hook.remove()
+        mean, square = torch.stack(sums[norm]).mean(0)
+        variance = (square - mean * mean).clamp_min(0)
+        scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+        norm.bias.add_((mean - norm.running_mean) * scale)
+        norm.weight.copy_(scale * torch.sqrt(variance + norm.eps))
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+    return net.train()
 
 
 Named = tuple[str, nn.Module | None]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import _core
-from ...geometry.cameras import Camera
+from ...geometry.cameras import Camera, relative_map
 from .photometry import through_a_camera
 from .shapes import Shape, ground, random_rotation, random_shape, turned, wall
 from .textures import SIDE, random_tile
@@ -126,13 +126,13 @@ def _photograph(random: Random, shapes: list[Shape], cameras: list[Camera], tile
 def _visible(depth: Array, reference: Camera, other: Array, source: Camera) -> NDArray[np.bool_]:
     """Whether the source's z-buffer shows the surface that the reference sees."""
     h, w = depth.shape
-    y, x = np.mgrid[:h, :w]
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(reference.K).T
-    world = (rays * depth[..., None] - reference.t) @ reference.R
-    q = world @ (source.K @ source.R).T + source.K @ source.t
-    z = np.maximum(q[..., 2], 1e-9)
-    u, v = np.rint(q[..., 0] / z).astype(int), np.rint(q[..., 1] / z).astype(int)
-    inside = (q[..., 2] > 0) & (u >= 0) & (v >= 0) & (u < source.width) & (v < source.height) & (depth > 0)
+    y, x = np.arange(h, dtype=np.float32)[:, None], np.arange(w, dtype=np.float32)
+    m = relative_map(reference, source)
+    near = depth.astype(np.float32)
+    q = [(m[3 * k] * x + (m[3 * k + 1] * y + m[3 * k + 2])) * near + m[9 + k] for k in range(3)]
+    z = np.maximum(q[2], np.float32(1e-9))
+    u, v = (np.clip(np.rint(a / z), -1, side).astype(np.int32) for a, side in ((q[0], source.width), (q[1], source.height)))
+    inside = (q[2] > 0) & (u >= 0) & (v >= 0) & (u < source.width) & (v < source.height) & (near > 0)
     seen = other[np.clip(v, 0, source.height - 1), np.clip(u, 0, source.width - 1)]
     return inside & (np.abs(seen - z) < 0.03 * z)
 
@@ -221,9 +221,17 @@ def _around(axis: Array, angle: float) -> Array:
 
 
 def random_views(
-    random: Random, tiles: Tiles, views: int = 3, width: int = 256, height: int = 192, *, floating: bool = True, wide: bool = True
+    random: Random,
+    tiles: Tiles,
+    views: int = 3,
+    width: int = 256,
+    height: int = 192,
+    *,
+    floating: bool = True,
+    wide: bool = True,
+    every: bool = False,
 ) -> list[Sample]:
-    """Posed views of a scene, neighbours up to 45 degrees apart, or unless ``wide`` up to 8: two of them in turn are the reference.
+    """Posed views of a scene, neighbours up to 45 degrees apart, or unless ``wide`` up to 8: two, or ``every`` one, in turn the reference.
 
     Half of the scenes are of floating shapes, half of a body that stands on the ground amid the cameras.
     """
@@ -264,7 +272,7 @@ def random_views(
         seen = np.stack([_visible(depth, cameras[reference], depths[k], cameras[k]) for k in order[1:]])
         return Sample(photographs[order], tuple(cameras[k] for k in order), inverse, seen, (low * less, high * more))
 
-    return [look(0), look(int(random.integers(1, views)))]
+    return [look(k) for k in (range(views) if every else (0, int(random.integers(1, views))))]
 
 
 def contact_sheet(seed: int, held_out: bool, rows: int = 8) -> tuple[NDArray[np.uint8], float]:
