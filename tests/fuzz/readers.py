@@ -44,7 +44,8 @@ def targets(folder: Path) -> list[Target]:
     read = {"pfm": read_pfm, "nurbs": load_obj, "index": lambda f: write_page(f.parent)}
     read |= dict.fromkeys(("glb", "ply", "stl", "off", "obj"), load_geometry)
     read |= dict.fromkeys(("png", "jpg", "bmp", "tif", "webp"), lambda f: (read_image(f), read_mask(f)))
-    read["store"] = lambda f: Store(f.parent.parent).load(f.stem)
+    store = Store(folder / "files" / "store")
+    read["store"] = lambda _: store.load(seeds.KEY)
     out += [Target(name, file, lambda name=name, file=file: read[name](file)) for name, file in single.items()]
     out.append(Target("core obj", single["obj"], lambda: _core.read_obj(str(single["obj"]))))
     return out

@@ -19,6 +19,8 @@ from mvcore.pipeline.store import Store
 from PIL import Image
 
 COUNT = 3
+KEY = "ab" * 20
+"""Of an entry of the store."""
 
 
 def scenes(folder: Path) -> dict[str, Path]:
@@ -190,8 +192,8 @@ def files(folder: Path) -> dict[str, Path]:
     net = np.random.default_rng(1).random((4, 4, 3))
     save_obj(out["nurbs"], [mvcore.nurbs.Surface(net, knots, knots, np.ones((4, 4))), mvcore.nurbs.Curve(net[0], knots)])
     store = Store(folder / "store")
-    store.save("ab" * 20, {"a": np.arange(6.0), "b": np.zeros((2, 2), np.uint8)}, {"x": 1})
-    out["store"] = store.path("ab" * 20)
+    store.save(KEY, {"a": np.arange(6.0), "b": np.zeros((2, 2), np.uint8)}, {"x": 1})
+    out["store"] = store.path(KEY)
     out["index"] = folder / "clip" / "index.json"
     out["index"].parent.mkdir()
     box.export(folder / "clip" / "a.glb")
