@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FormatError
+from .. import limits
 from ..limits import MOST_SIDE, read_text
 from ..pairing import natural_order
 from .places import IMAGE_SUFFIXES
@@ -136,14 +136,7 @@ def read_json(path: Path) -> Entry:
     text = read_text(path)
     if text.count(",") + text.count("[") + text.count("{") > MOST_VALUES:
         raise FormatError(f"{path}: expected at most {MOST_VALUES} values")
-    try:
-        return Entry(json.loads(text), path)
-    except json.JSONDecodeError as error:
-        raise FormatError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
-    except RecursionError:
-        raise FormatError(f"{path}: nested too deep") from None
-    except ValueError as error:  # whole numbers of thousands of digits
-        raise FormatError(f"{path}: {error}") from None
+    return Entry(limits.read_json(path), path)
 
 
 def read_toml(path: Path) -> Entry:
