@@ -22,7 +22,7 @@ from .executors import local_workers, open_pool
 from .store import Store
 from .tasks import Place, Runner, Task
 
-CACHE = 512 << 20
+CACHE = 256 << 20
 """Bytes of results kept in memory where ``max_memory`` is not given."""
 REMOTE_THREADS = 64
 """Tasks that are sent out at a time to an executor or a cluster."""
