@@ -87,6 +87,13 @@ def test_ctrl_c_ends_a_kernel(kernel):
         process.stdout.close()
 
 
+def atlas_of(vertices, faces, labels, matrices, image):
+    """An atlas that lacks only its end."""
+    atlas = _core.Atlas(vertices, faces, labels, matrices)
+    atlas.add_view(0, image)
+    return atlas
+
+
 def small_calls():
     """Every kernel with long loops, on next to nothing."""
     rng = np.random.default_rng(0)
@@ -112,7 +119,8 @@ def small_calls():
     blocks = np.ascontiguousarray(np.argwhere(np.ones((2, 2, 2))).astype(np.uint32))
     samples = rng.normal(size=(8, 8, 8, 8)).astype(np.float32)
     n, count = len(vertices), len(faces)
-    qualities, colours = [np.ones(count, np.float32)], [np.zeros((count, 3), np.uint8)]
+    lists = (np.zeros((count, 1), np.int16), np.ones((count, 1), np.float32), np.zeros((count, 1, 3), np.uint8))
+    gains = np.ones((1, 3), np.float32)
     labels = np.zeros(count, np.int32)
     shading = (np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32), np.zeros(count, np.uint16))
     tiles, gloss = np.zeros((2, 8, 8, 3), np.uint8), np.zeros((1, 5), np.float32)
@@ -142,8 +150,8 @@ def small_calls():
         "close_holes": lambda: _core.close_holes(vertices, opened, 50),
         "nearest": lambda: _core.nearest(vertices, vertices),
         "rasterize": lambda: _core.rasterize(vertices, faces, matrix, 32, 24),
-        "select_views": lambda: _core.select_views(vertices, faces, qualities, colours, 0.5, 0.0, 2),
-        "build_atlas": lambda: _core.build_atlas(vertices, faces, labels, [rgb], [matrix], [[1.0, 1.0, 1.0]], 4096),
+        "select_views": lambda: _core.select_views(vertices, faces, *(a.copy() for a in lists), gains, 0.5, 0.0, 2),
+        "finish": lambda: atlas_of(vertices, faces, labels, matrices, rgb).finish(gains),
         "shade": lambda: _core.shade(vertices, faces, *shading, tiles, gloss, matrices, [0.0, 0, 1], 32, 24),
     }
 
