@@ -193,6 +193,7 @@ def select_views(
     least_patch: int,
 ) -> _I32: ...
 
+@final
 class Atlas:
     """A texture atlas in the making; once finished it is empty."""
 
