@@ -130,7 +130,7 @@ def test_options_reach_the_library(folder, tmp_path, calls, monkeypatch):
     assert json.loads(report.read_text())["view_numbers"] == [0, 2, 3]
     calls.clear()
     run("reconstruct", folder, "-o", tmp_path / "a.glb", "--scheduler", "tcp://host:8786")
-    assert calls[0].scheduler == "tcp://host:8786"
+    assert calls[0].scheduler.address == "tcp://host:8786"
     assert not hasattr(calls[0], "executor")
     assert calls[0].masks is None
 

@@ -1,5 +1,9 @@
 """A short form of `make fuzz`: some hundreds of cases, of which every seed's valid form reads."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from fuzz import kernels, readers, runner
@@ -12,10 +16,16 @@ def test_valid_files_are_read(tmp_path):
         assert target.read() is not None, target.name
 
 
-def test_mutated_files_are_read_or_refused(tmp_path):
-    outcome = runner.run(readers.Fuzzer(tmp_path, seed=1), 400, seconds=30)
-    assert outcome.ran > 0
-    assert not outcome.failures, str(outcome)
+def fuzz(module: str) -> str:
+    """In a process of its own: the cases fork, and threads of kernels that ran here before would be missing there."""
+    command = [sys.executable, "-m", f"fuzz.{module}", "--seconds", "30", "--count", "400", "--seed", "1"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_mutated_files_are_read_or_refused():
+    assert int(fuzz("readers").split()[0]) > 0
 
 
 def test_valid_calls_succeed():
@@ -24,9 +34,7 @@ def test_valid_calls_succeed():
 
 
 def test_mad_calls_succeed_or_are_refused():
-    outcome = runner.run(kernels.Fuzzer(seed=1), 400, seconds=30, allowed=kernels.ALLOWED)
-    assert outcome.ran > 0
-    assert not outcome.failures, str(outcome)
+    assert int(fuzz("kernels").split()[0]) > 0
 
 
 def test_the_runner_sees_what_goes_wrong():

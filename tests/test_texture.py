@@ -191,7 +191,7 @@ def test_an_occluder_in_a_darker_image_is_not_painted(ring):
 
 def test_an_earlier_frame_decides_where_views_are_about_as_good(ring):
     cameras, images, _, _ = ring
-    surface, config = sphere(), TextureConfig(candidates=1, loyalty=100.0, least_patch=1, outlier=0)
+    surface, config = sphere(), TextureConfig(candidates=1, loyalty=1.0, least_patch=1, outlier=0)
     first = texture(surface, images, cameras, config=config)
     centers = surface.vertices[surface.faces].mean(1)
     # Not the best view of a face, the only one that its list would hold.

@@ -24,7 +24,7 @@ from .records import Found, Record
 from .values import Float, Rows, files_in, head, images_in
 
 FIRST = re.compile(r"\s*#\s*Bundle file v0\.[0-9]+")
-LIST_LINE = re.compile(r"^(.*?)(?:\s+0\s+[0-9.eE+-]+)?\s*$")
+LIST_LINE = re.compile(r"^(.*?\S)(?:[ \t]+0[ \t]+[0-9.eE+-]+)?$")
 """A name, and for some images ``0`` and the focal length of their EXIF data."""
 MOST_CAMERAS = 1_000_000
 
@@ -86,7 +86,7 @@ def _names(path: Path, count: int, images: Path | None) -> tuple[list[str], list
         beside += sorted(folder.glob("*list*.txt"))
     for file in beside:
         if file.is_file():
-            lines = [LIST_LINE.match(line)[1].strip() for line in read_text(file).splitlines() if line.strip()]  # type: ignore[index]
+            lines = [LIST_LINE.match(line.strip())[1] for line in read_text(file).splitlines() if line.strip()]  # type: ignore[index]
             if len(lines) == count:
                 return lines, []
     files = images_below(images) if images is not None else images_in(path.parent / "images") or images_in(path.parent)

@@ -24,7 +24,7 @@ SUFFIXES = (".yml", ".yaml", ".xml", ".json")
 SNIFF = 1 << 16
 """Bytes that are searched for the names of the two matrices."""
 NUMBER = r"[ \t]*[-+.]?[\d.]+(?:[eE][-+]?\d+)?[ \t]*(?:$|<)"
-KEY = re.compile(rf"""^\s*["<]?([A-Za-z]\w*)"?(?:[ \t]*:(?!{NUMBER})|[ \t]+\w|>(?!{NUMBER}))""", re.MULTILINE)
+KEY = re.compile(rf"""^[ \t]*["<]?([A-Za-z]\w*)"?(?:[ \t]*:(?!{NUMBER})|[ \t]+\w|>(?!{NUMBER}))""", re.MULTILINE)
 """A name that does not stand before a single number: k1 may be a coefficient."""
 MATRIX = ("k", "m", "cm", "mtx", "cameramatrix", "cammatrix", "intrinsic", "intrinsics", "intrinsicmatrix")
 LENS = ("d", "dist", "dc", "distcoeffs", "distcoeff", "distcoef", "distortion", "distortioncoefficients", "distortioncoeffs")
