@@ -162,20 +162,20 @@ class ClipRun:
         """The numbers of the frames as they are done, in order, with progress in steps between them."""
 
         def events() -> Iterator[int | None]:
-            shown = 0
+            shown, total = 0, STEPS * len(done)
             for t, future in done.items():
                 while not future.done():
                     try:
                         self.steps.get(timeout=0.1)
                     except queue.Empty:
                         continue
-                    if shown < STEPS * len(done) - 1:
+                    if shown < total - (len(done) - t):  # each frame counts once more when it is done
                         shown += 1
                         yield None
-                while shown < STEPS * (t + 1) - 1:
+                for _ in range(shown, STEPS * (t + 1) - 1):
                     shown += 1
                     yield None
-                shown = max(shown, STEPS * (t + 1))
+                shown += 1
                 yield t
 
         yield from (t for t in self.track(events(), "frames", STEPS * len(done)) if t is not None)
