@@ -136,7 +136,7 @@ class _Fusion:
         return cls(
             depths,
             cameras,
-            [float(np.median(z)) if len(z) else 0.0 for z in inside],
+            [_distance(c, z, bounds) for c, z in zip(cameras, inside, strict=True)],
             outlines,
             list(windows or [(0.0, 0.0, c.width - 1.0, c.height - 1.0) for c in cameras]),
             masks is None and found is not None,
@@ -252,7 +252,7 @@ def fuse(
     Parameters
     ----------
     depths : one a camera, of the camera's size, or None where it has none; weights are
-        confidence times (the view's median depth / z)⁴, as σz grows with z².
+        confidence times (the view's distance of the target / z)⁴, as σz grows with z².
     bounds : (2, 3) world.
     masks : (h, w) uint8, non-zero on the target.
     windows : what each camera saw, of which its masks may be a part cut out; by default the masks' own size.
@@ -332,6 +332,14 @@ def _may_see(camera: Camera, window: Window, box: Bounds) -> bool:
     low, high = (f(camera.project(corners(box)), axis=0) for f in (np.min, np.max))
     first, last = np.minimum(window[:2], 0) - 1, np.maximum(window[2:], (camera.width - 1, camera.height - 1)) + 1
     return bool((low <= last).all() and (high >= first).all())
+
+
+def _distance(camera: Camera, inside: NDArray[np.float32], bounds: Bounds) -> float:
+    """z-depth at which a view's depth weighs its confidence: the farther of the box's middle and the median depth in it.
+
+    Where cameras look inwards that is the middle of what they look at; in rooms and streets the median, as the box begins at the camera.
+    """
+    return max(box_depth(camera, bounds), float(np.median(inside)) if len(inside) else 0.0)
 
 
 def _weights(view: DepthMap, scale: float) -> NDArray[np.float32]:
