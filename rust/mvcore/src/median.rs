@@ -94,7 +94,7 @@ fn median_at(
     let inside = x >= near.radius && y >= near.radius && x + near.radius < w && y + near.radius < h;
     let place = |&(i, j, weight): &(isize, isize, f32)| {
         let (u, v) = (x.wrapping_add_signed(i), y.wrapping_add_signed(j));
-        (inside || (u < w && v < h)).then_some((v * w + u, weight))
+        (inside || (u < w && v < h)).then(|| (v * w + u, weight))
     };
     if let Some(slack) = slack {
         // Where nothing around differs, the median does not either.
