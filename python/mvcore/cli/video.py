@@ -39,7 +39,7 @@ def video(
     ] = "auto",
     start: Annotated[int, typer.Option(help="First frame.", rich_help_panel=options.INPUT)] = 0,
     stop: Annotated[int | None, typer.Option(help="Frame to stop before.", rich_help_panel=options.INPUT)] = None,
-    stride: Annotated[int, typer.Option(help="Take every so manieth frame.", rich_help_panel=options.INPUT)] = 1,
+    stride: Annotated[int, typer.Option(help="Take every Nth frame.", rich_help_panel=options.INPUT)] = 1,
     target: Annotated[str, typer.Option(help="free, or rigid: all frames make one model.", rich_help_panel=options.SETTINGS)] = "free",
     config: options.Settings = None,
     max_image_size: options.MaxImageSize = None,
