@@ -320,7 +320,7 @@ fn meshes(c: &mut Criterion) {
         lists.keep_best(k as i16, &rated.quality, &rated.colour).unwrap();
     }
     group.bench_function("compare_views, 8 views", |b| b.iter(|| compare_views(&lists, 8, 2000).unwrap()));
-    let params = SelectParams { seam: 0.5, outlier: 60.0, least_patch: 32 };
+    let params = SelectParams { seam: 0.2, unit: 2.4 / n as f64, outlier: 60.0, least_patch: 12.0 };
     let gains = [[1.0; 3]; 8];
     group.bench_function("select_views, 8 views", |b| {
         b.iter(|| select_views(mesh, &mut lists, &gains, &params).unwrap());

@@ -148,9 +148,10 @@ def small_calls():
         "isosurface_dense": lambda: _core.isosurface_dense(ball),
         "isosurface_sparse": lambda: _core.isosurface_sparse(blocks, samples),
         "close_holes": lambda: _core.close_holes(vertices, opened, 50),
+        "decimate": lambda: _core.decimate(vertices, opened, 0.1),
         "nearest": lambda: _core.nearest(vertices, vertices),
         "rasterize": lambda: _core.rasterize(vertices, faces, matrix, 32, 24),
-        "select_views": lambda: _core.select_views(vertices, faces, *lists, gains, 0.5, 0.0, 2),
+        "select_views": lambda: _core.select_views(vertices, faces, *lists, gains, 1.0, 0.5, 0.0, 2),
         "Atlas": build_atlas,
         "shade": lambda: _core.shade(vertices, faces, *shading, tiles, gloss, matrices, [0.0, 0, 1], 32, 24),
     }

@@ -28,6 +28,7 @@ from mvcore.mesh.surface import (
     Surface,
     cleaned,
     decimate,
+    drop_unseen,
     drop_small_parts,
     extract_surface,
     isosurface,
@@ -282,7 +283,7 @@ def test_fusion_equals_its_twin(ring):
     both = np.isfinite(twin) & np.isfinite(ours) & (np.linalg.norm(points, axis=1) < 0.62)
     assert both.sum() > 1000
     assert np.median(np.abs(twin - ours)[both]) < 0.05
-    surface = extract_surface(volume)
+    surface = extract_surface(volume, SurfaceConfig(decimation=0))
     radius = np.linalg.norm(surface.vertices, axis=1)
     assert np.abs(radius - 0.5).mean() < 0.1 * volume.voxel
 
@@ -438,13 +439,13 @@ def test_small_holes_are_closed_unless_the_settings_say_otherwise():
     middles = vertices[faces].mean(1) - 20
     small, large = np.linalg.norm(middles - (14.3, 0, 0), axis=1) < 3, middles[:, 0] < -6
     open_ = Surface(vertices.astype(np.float64), np.ascontiguousarray(faces[~small & ~large]))
-    closed = cleaned(open_, SurfaceConfig(close_holes=40))
+    closed = cleaned(open_, 1.0, SurfaceConfig(close_holes=40, decimation=0))
     assert (closed.vertices[closed.faces[: len(open_.faces)]] == open_.vertices[open_.faces]).all()
     added = closed.vertices[closed.faces[len(open_.faces) :]].mean(1) - 20
     assert len(added) > 20
     assert (np.linalg.norm(added - (14.3, 0, 0), axis=1) < 4).all()  # the large one stays
     assert np.abs(np.linalg.norm(added, axis=1) - 14.3).max() < 0.7
-    assert len(cleaned(open_, SurfaceConfig(close_holes=0)).faces) == len(open_.faces)
+    assert len(cleaned(open_, 1.0, SurfaceConfig(close_holes=0, decimation=0)).faces) == len(open_.faces)
 
 
 def test_smoothing_keeps_the_volume_and_decimation_the_shape():
@@ -454,7 +455,7 @@ def test_smoothing_keeps_the_volume_and_decimation_the_shape():
     radius = np.linalg.norm(smooth(noisy, 10).vertices - center, axis=1)
     assert radius.std() < 0.5 * np.linalg.norm(noisy.vertices - center, axis=1).std()
     assert abs(radius.mean() - 14) < 0.1
-    small = decimate(surface, 500)
+    small = decimate(surface, max_faces=500)
     assert 300 < len(small.faces) <= 510
     assert np.abs(np.linalg.norm(small.vertices - center, axis=1) - 14).max() < 0.5
 
@@ -551,3 +552,24 @@ def test_a_hollow_volume_has_the_surface_of_the_full_one(ring):
     one, two = (extract_surface(v) for v in (full, hollow))
     assert np.array_equal(one.vertices, two.vertices)
     assert np.array_equal(one.faces, two.faces)
+
+
+def test_a_hull_that_no_camera_sees_is_not_made_and_what_one_sees_stays_the_same(ring):
+    # Three neighbours: most of the hull lies behind. Half of what they see is measured.
+    cameras, depths = ring[0][:3], ring[2][:3]
+    half = np.arange(cameras[0].width) < cameras[0].width // 2
+    maps = [DepthMap(np.where(half, d, 0).astype(np.float32), (half & (d > 0)).astype(np.float32)) for d in depths]
+    masks = [(d > 0).astype(np.uint8) * 255 for d in depths]
+    bounds, config = np.array([[-0.9] * 3, [0.9] * 3]), VolumeConfig(voxel=0.006)
+    whole, part = (
+        list(fuse_tiles(maps, cameras, bounds, masks, config, unseen_reach=reach)) for reach in (None, 1.0)
+    )
+    assert sum(len(v.coords) for v in part) < 0.75 * sum(len(v.coords) for v in whole)
+    full, less = isosurface(whole), isosurface(part)
+    seen = drop_unseen(full, cameras, config.voxel, 1.0)
+    missing, _ = _core.nearest(seen.vertices, np.ascontiguousarray(less.vertices))
+    assert len(seen.vertices) > 10_000
+    assert (missing < 1e-9).mean() > 0.99
+    # Smoothing lacks its surroundings where blocks were left out.
+    moved, _ = _core.nearest(less.vertices, np.ascontiguousarray(full.vertices))
+    assert moved.max() < 2 * config.voxel

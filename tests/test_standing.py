@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from conftest import look_at, texture_of
 from mvcore import _core
-from mvcore.config import Config, StandingConfig, VolumeConfig
+from mvcore.config import Config, StandingConfig, SurfaceConfig, VolumeConfig
 from mvcore.geometry.cameras import Camera
 from mvcore.mesh.surface import Surface, drop_cavities, drop_unseen, extract_surface
 from mvcore.silhouettes import object_segmentation as standing
@@ -169,7 +169,7 @@ def test_silhouettes_complete_the_surface_and_cut_nothing(stand):
     found = find_standing(images, cameras, maps, BOUNDS)
     config = VolumeConfig(voxel=0.02)
     parts = {
-        n: extract_surface(fuse_tiles(maps, cameras, BOUNDS, None, config, found=s))
+        n: extract_surface(fuse_tiles(maps, cameras, BOUNDS, None, config, found=s), SurfaceConfig(decimation=0))
         for n, s in (("measured", None), ("completed", found.silhouettes))
     }
     ball = plain_sphere_points()

@@ -83,7 +83,7 @@ def test_rejected_views_equal_their_twin(seed):
     gains = np.random.default_rng(seed).uniform(0.7, 1.4, (9, 3)).astype(np.float32)
     vertices, faces = np.zeros((3, 3)), np.tile(np.uint32([0, 1, 2]), (30, 1))
     lists = candidates.views, candidates.qualities, candidates.colours
-    labels = _core.select_views(vertices, faces, *lists, gains, 0.5, 25.0, 1)
+    labels = _core.select_views(vertices, faces, *lists, gains, 1.0, 0.5, 25.0, 1)
     for kept, views, label in zip(as_dicts(candidates), before, labels, strict=True):
         assert set(views) - set(kept) == reference.outliers(views, gains, 25.0)
         assert label in kept or (label == -1 and not kept)

@@ -16,6 +16,7 @@ __all__ = [
     "components",
     "consistency",
     "correlate",
+    "decimate",
     "distance_transform",
     "encode_png",
     "expect",
@@ -94,6 +95,7 @@ def consistency(
     pixel_unit: float,
     depth_unit: float,
 ) -> tuple[_F32, _U8]: ...
+def decimate(vertices: _F64, faces: _U32, error: float, most_faces: int = 18446744073709551615) -> tuple[_F64, _U32]: ...
 def distance_transform(sites: _U8) -> tuple[_U32, _U32]: ...
 def fuse(
     origin: Sequence[float],
@@ -106,6 +108,7 @@ def fuse(
     projections: _F64,
     *,
     tile: Sequence[Sequence[int]] | None = ...,
+    unseen: NDArray[np.bool_] | None = None,
     truncation: float,
     free_weight: float,
     min_weight: float,
@@ -188,9 +191,10 @@ def select_views(
     qualities: _F32,
     colours: _U8,
     gains: _F32,
+    unit: float,
     seam: float,
     outlier: float,
-    least_patch: int,
+    least_patch: float,
 ) -> _I32: ...
 
 @final

@@ -200,7 +200,7 @@ class VolumeConfig(Checked):
     """With masks, elsewhere: where depth is known here and not there, the solid inside of the hull would leave crumbs."""
     hull_tolerance: Annotated[float, within(0, 1, "share of the views")] = 0.04
     """Share of the silhouettes that may disagree: one wrong mask among 25 does no harm; with fewer views each is needed."""
-    max_memory: Annotated[int, within(1, 1 << 50, "bytes")] = 4 << 30
+    max_memory: Annotated[int, within(1, 1 << 50, "bytes")] = 256 << 20
     """Bytes of the volume; the voxels grow until it fits, and the report says so."""
 
 
@@ -285,8 +285,12 @@ class SurfaceConfig(Checked):
     measurement. None keeps them, and with them a closed surface."""
     smooth: Annotated[int, within(0, 1000, "rounds")] = 0
     """Rounds of Taubin smoothing: rounds off noise without shrinking."""
+    decimation: Annotated[float, within(0, 1000, "voxels")] = 0.25
+    """Voxels by which decimation may move the surface, as a root mean square. At 0.25 (a third of a
+    pixel footprint) 90 to 97 % of the faces go, and F-scores at 1, 2 and 4 footprints change by at
+    most .004, .001 and .001. 0 keeps all faces."""
     max_faces: Annotated[int, within(4, 1_000_000_000, "faces")] | None = None
-    """Faces to decimate to by quadric errors; None keeps all."""
+    """Faces to decimate to where those are more, whatever that moves; None sets no limit."""
 
 
 @dataclass(frozen=True)
@@ -295,15 +299,15 @@ class TextureConfig(Checked):
 
     candidates: Annotated[int, within(1, 64, "views")] = 8
     """Views that are kept for each face, the best by resolution and contrast: memory and cost do not grow with the views beyond."""
-    seam: Annotated[float, within(0, 1000, "cost")] = 0.5
-    """Cost of a seam along one edge against the best and the worst view of a face (1)."""
+    seam: Annotated[float, within(0, 1000, "cost a voxel")] = 0.2
+    """Cost of a voxel of seam against the best and the worst view of a square voxel of surface (1)."""
     outlier: Annotated[float, within(0, 1000, "grey levels")] = 60.0
     """Grey levels, after the colour gains, by which a view may differ from the median of a face's: beyond, it shows an occluder or a
     highlight."""
     loyalty: Annotated[float, within(0, 1, "share")] = 0.5
     """Share by which the view that a face had in the frame before counts as better: it changes only where another is clearly better."""
-    least_patch: Annotated[int, within(0, 1_000_000_000, "faces")] = 32
-    """Faces below which a patch takes its neighbour's view."""
+    least_patch: Annotated[float, within(0, 1e9, "square voxels")] = 12.0
+    """Area below which a patch takes its neighbour's view."""
     mask_erosion: Annotated[int, within(0, 1000, "pixels")] = 3
     """Pixels taken off the masks: their borders mix in background."""
     max_size: Annotated[int, within(16, 65_536, "texels")] = 8192

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -59,27 +60,43 @@ def isosurface(volume: Volume | Iterable[Volume]) -> Surface:
     points, faces, count = [], [], 0
     grid: Volume | None = None
     for part in [volume] if isinstance(volume, Volume) else volume:
-        grid = part
         p, f = _core.isosurface_sparse(part.coords, part.values)
+        grid = replace(part, coords=part.coords[:0], values=part.values[:0])
         points.append(p)
-        faces.append(f + np.uint32(count))
+        f += np.uint32(count)
+        faces.append(f)
         count += len(p)
     require(grid is not None, "volume", "one part or more", "none")
     assert grid is not None
-    vertices, triangles = np.concatenate(points), np.concatenate(faces)
-    if len(points) > 1:
-        vertices, triangles = _joined(vertices, triangles)
-    return Surface(grid.origin + grid.voxel * vertices.astype(np.float64), triangles)
+    vertices, triangles = (points[0], faces[0]) if len(points) == 1 else _joined(np.concatenate(points), faces)
+    del points, faces
+    world = vertices.astype(np.float64)
+    world *= grid.voxel
+    world += grid.origin
+    return Surface(world, triangles)
 
 
-def _joined(vertices: NDArray[np.float32], faces: Faces) -> tuple[NDArray[np.float32], Faces]:
+def _joined(vertices: NDArray[np.float32], faces: list[Faces]) -> tuple[NDArray[np.float32], Faces]:
     """One vertex where parts have one each: vertices of a single part never coincide."""
     shared = np.flatnonzero((vertices % SIDE == 0).any(1))
     rows = np.ascontiguousarray(vertices[shared]).view(np.dtype((np.void, 12))).ravel()
     _, first, number = np.unique(rows, return_index=True, return_inverse=True)
     owner = np.arange(len(vertices), dtype=np.uint32)
     owner[shared] = shared[first[number]]
-    return _used(vertices, owner[faces])
+    for n, part in enumerate(faces):
+        faces[n] = _renumbered(owner, part)
+    return _used(vertices, np.concatenate(faces))
+
+
+CHUNK = 1 << 18
+"""Faces whose vertices are looked up at a time: NumPy makes indices of eight bytes of them."""
+
+
+def _renumbered(number: NDArray[np.uint32], faces: Faces) -> Faces:
+    out = np.empty_like(faces)
+    for n in range(0, len(faces), CHUNK):
+        out[n : n + CHUNK] = number[faces[n : n + CHUNK]]
+    return out
 
 
 def extract_surface(volume: Volume | Iterable[Volume], config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
@@ -90,13 +107,25 @@ def extract_surface(volume: Volume | Iterable[Volume], config: SurfaceConfig | N
     ReconstructionError
         The field has no surface.
     """
-    return cleaned(isosurface(volume), config, solid)
+    parts = iter([volume] if isinstance(volume, Volume) else volume)
+    first = next(parts, None)
+    require(first is not None, "volume", "one part or more", "none")
+    assert first is not None
+    return cleaned(isosurface(chain([first], parts)), first.voxel, config, solid)
 
 
-def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
+def cleaned(surface: Surface, voxel: float, config: SurfaceConfig | None = None, solid: bool = False) -> Surface:
     """Small parts dropped and small holes closed, then smoothed and decimated as configured.
 
-    ``solid`` says that the surface is closed (silhouettes were given): bubbles inside it are dropped too. Errors as of `extract_surface`.
+    Parameters
+    ----------
+    voxel : of the field, world units.
+    solid : the surface is closed (silhouettes were given): bubbles inside it are dropped too.
+
+    Raises
+    ------
+    ReconstructionError
+        There is no surface.
     """
     config = config or SurfaceConfig()
     if not len(surface.faces):
@@ -107,9 +136,7 @@ def cleaned(surface: Surface, config: SurfaceConfig | None = None, solid: bool =
     surface = close_holes(surface, config.close_holes)
     if config.smooth:
         surface = smooth(surface, config.smooth)
-    if config.max_faces is not None and len(surface.faces) > config.max_faces:
-        surface = decimate(surface, config.max_faces)
-    return surface
+    return decimate(surface, config.decimation * voxel, config.max_faces)
 
 
 def compact(vertices: Float, faces: Faces) -> Surface:
@@ -120,9 +147,10 @@ def compact(vertices: Float, faces: Faces) -> Surface:
 def _used(vertices: NDArray[Any], faces: Faces) -> tuple[NDArray[Any], Faces]:
     """The vertices that faces have, and the faces with their new numbers."""
     used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    number = np.cumsum(used, dtype=np.uint32) - 1
-    return vertices[used], number[faces].astype(np.uint32)
+    for n in range(0, len(faces), CHUNK):
+        used[faces[n : n + CHUNK]] = True
+    number = np.cumsum(used, dtype=np.uint32) - np.uint32(1)
+    return vertices[used], _renumbered(number, faces)
 
 
 def drop_small_parts(surface: Surface, share: float) -> Surface:
@@ -207,14 +235,23 @@ def smooth(surface: Surface, rounds: int) -> Surface:
     return Surface(v, surface.faces)
 
 
-def decimate(surface: Surface, max_faces: int) -> Surface:
-    """Quadric-error decimation to about ``max_faces`` faces (fast-simplification)."""
-    import fast_simplification
+def decimate(surface: Surface, error: float = 0.0, max_faces: int | None = None) -> Surface:
+    """Collapses edges by quadric errors (Garland and Heckbert, SIGGRAPH 1997).
 
-    require(max_faces >= 4, "max_faces", "at least 4", max_faces)
-    # The library works in float32: centred and scaled, nothing of the position is lost.
-    center = surface.vertices.mean(0)
-    scale = np.abs(surface.vertices - center).max()
-    points = ((surface.vertices - center) / scale).astype(np.float32)
-    v, f = fast_simplification.simplify(points, surface.faces.astype(np.int32), target_count=max_faces)
-    return compact(v.astype(np.float64) * scale + center, f.astype(np.uint32))
+    Parameters
+    ----------
+    error : world units by which the surface may move, as a root mean square over the faces that meet at an edge.
+    max_faces : 4 or more, kept to whatever it moves; None sets no limit.
+
+    Examples
+    --------
+    >>> x, y, z = np.mgrid[-9:10, -9:10, -9:10].astype(np.float32)
+    >>> vertices, faces = marching_cubes(np.sqrt(x**2 + y**2 + z**2) - 6.3)
+    >>> len(decimate(Surface(vertices.astype(float), faces), error=0.05).faces) < len(faces) / 2
+    True
+    """
+    require(np.isfinite(error) and error >= 0, "error", "0 or more", error)
+    require(max_faces is None or max_faces >= 4, "max_faces", "4 or more, or None", max_faces)
+    vertices, faces = np.ascontiguousarray(surface.vertices), np.ascontiguousarray(surface.faces)
+    limit = () if max_faces is None else (max_faces,)
+    return compact(*_core.decimate(vertices, faces, error, *limit))

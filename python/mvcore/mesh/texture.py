@@ -158,7 +158,7 @@ def texture(
     gains = prior.gains if prior.gains is not None else colour_gains(candidates, len(cameras))
     gains = np.ascontiguousarray(gains, np.float32)
     lists = candidates.views, candidates.qualities, candidates.colours
-    labels = _core.select_views(vertices, faces, *lists, gains, config.seam, config.outlier, config.least_patch)
+    labels = _core.select_views(vertices, faces, *lists, gains, voxel, config.seam, config.outlier, config.least_patch)
     del candidates, lists, preferred
     return _painted(vertices, faces, labels, images, cameras, gains, config, track)
 
@@ -211,11 +211,13 @@ def _rate(
 
 
 def _preferred(vertices: Float, faces: NDArray[np.uint32], prior: TexturePrior, voxel: float) -> NDArray[np.int32] | None:
-    """The view that the nearest earlier face within two voxels had, -1 where there is none."""
+    """The view that the nearest earlier face had, -1 where that is more than two voxels and a face's size away."""
     if prior.centers is None or prior.views is None or not len(prior.centers) or not len(faces):
         return None
-    _, number = _core.nearest(vertices[faces].mean(1), np.ascontiguousarray(prior.centers, np.float64), 2 * voxel)
-    return np.where(number >= 0, prior.views[number], -1).astype(np.int32)
+    corners = vertices[faces]
+    size = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max(1)
+    distance, number = _core.nearest(corners.mean(1), np.ascontiguousarray(prior.centers, np.float64))
+    return np.where(distance <= 2 * voxel + size, prior.views[number], -1).astype(np.int32)
 
 
 def _painted(

@@ -443,6 +443,7 @@ class FieldSettings:
     carve: CarveConfig
     standing: StandingConfig
     min_component: float
+    unseen_reach: float | None
 
 
 def _field(
@@ -457,7 +458,9 @@ def _field(
     masks = _Masks(pixels) if rig.masked else None
     if rig.stereo:
         outlines = None if completion is None else completion.silhouettes
-        yield from fuse_tiles(depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines)
+        yield from fuse_tiles(
+            depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines, settings.unseen_reach
+        )
     elif settings.carve.photo_consistency:
         assert masks is not None
         hull = visual_hull(list(masks), rig.cameras, rig.box, settings.volume, report, rig.windows)
@@ -490,10 +493,12 @@ def draft(depths: Sequence[DepthMap | None], pixels: Sequence[Pixels], rig: Rig,
     completion, findings = complete(depths, pixels, rig, settings)
     volume, times = settings.volume, 1.0 if rig.masked else DRAFT_VOXEL
     wide = replace(volume, footprints=times * volume.footprints, voxel=volume.voxel and times * volume.voxel)
-    surface = _isosurface(depths, pixels, rig, completion, replace(settings, volume=wide), Report())
+    # What no camera sees, no view's depth starts from.
+    wanted = replace(settings, volume=wide, unseen_reach=settings.unseen_reach or 0.0)
+    surface = _isosurface(depths, pixels, rig, completion, wanted, Report())
     # Nobody sees it: it is neither closed nor smoothed nor decimated.
-    plain = SurfaceConfig(min_component=settings.min_component, close_holes=0)
-    return Draft(cleaned(surface, plain, solid=rig.masked), completion, findings)
+    plain = SurfaceConfig(min_component=settings.min_component, close_holes=0, decimation=0)
+    return Draft(cleaned(surface, 0.0, plain, solid=rig.masked), completion, findings)
 
 
 def complete(
@@ -566,7 +571,7 @@ def clean(extracted: Extracted, rig: Rig, config: SurfaceConfig) -> Cleaned:
         kept = drop_unseen(surface, rig.cameras, extracted.voxel, config.unseen_reach)
         figures["unseen_left_open"] = len(surface.faces) - len(kept.faces)
         surface = kept
-    return Cleaned(cleaned(surface, config, solid=rig.masked), Findings(figures))
+    return Cleaned(cleaned(surface, extracted.voxel, config, solid=rig.masked), Findings(figures))
 
 
 @dataclass(frozen=True)

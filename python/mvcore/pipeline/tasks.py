@@ -19,7 +19,7 @@ from .store import digest
 
 T = TypeVar("T")
 
-VERSION = 10
+VERSION = 11
 """Of what stages compute: results of other versions are not taken for this one's."""
 ATTEMPTS = 8
 """Times that inputs of a task that vanish are made again before it is an error."""

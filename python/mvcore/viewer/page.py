@@ -129,7 +129,7 @@ def _reduced(path: Path, limit: int) -> dict[str, Any]:
         # Charts share no vertices: joined, or the decimation would tear the mesh along every seam.
         merged = trimesh.Trimesh(vertices, faces, process=False)
         merged.merge_vertices(merge_tex=True, merge_norm=True)
-        small = decimate(Surface(np.asarray(merged.vertices, np.float64), np.asarray(merged.faces, np.uint32)), limit)
+        small = decimate(Surface(np.asarray(merged.vertices, np.float64), np.asarray(merged.faces, np.uint32)), max_faces=limit)
         from .. import _core
 
         _, number = _core.nearest(np.ascontiguousarray(small.vertices), np.ascontiguousarray(vertices))

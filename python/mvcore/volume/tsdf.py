@@ -17,6 +17,7 @@ from ..geometry.rig import box_depth, corners
 from ..silhouettes.occluder_repair import repaired_masks
 from ..types import Bounds, DepthMap, Report
 from .hull_prior import _open_share, hull_share, silhouette_distance
+from .unseen import COARSE, unseen_blocks
 
 Window = tuple[float, float, float, float]
 """x0, y0, x1, y1 in pixels of an image that may be a part of what the camera saw."""
@@ -152,10 +153,17 @@ class _Fusion:
         nothing = np.zeros((0, 3), np.uint32), np.zeros((0, SIDE, SIDE, SIDE), np.float32)
         return Volume(self.bounds[0] - 2 * voxel, voxel, (nx, ny, nz), *nothing)
 
-    def run(self, grid: Volume, tile: list[list[int]] | None = None, hollow: bool = False) -> Volume:
+    def run(
+        self,
+        grid: Volume,
+        tile: list[list[int]] | None = None,
+        hollow: bool = False,
+        unseen: NDArray[np.bool_] | None = None,
+    ) -> Volume:
         """The field, or the blocks from tile[0] up to tile[1]; MemoryError beyond ``max_memory``.
 
-        ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes.
+        ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes, and blocks
+        without measured surface that ``unseen`` flags, (nx, ny, nz) of the whole grid.
         """
         config = self.config
         blocks = np.array([[0, 0, 0], grid.blocks] if tile is None else tile)
@@ -170,6 +178,7 @@ class _Fusion:
             self.windows,
             np.stack([c.projection for c in self.cameras]),
             tile=tile,
+            unseen=None if unseen is None else np.ascontiguousarray(unseen[_slices(blocks)]),
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
@@ -211,7 +220,13 @@ class _Fusion:
             return False
         return all(self._map_bytes(grid, *half) < taken for half in halves)
 
-    def tiles(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
+    def tiles(self, grid: Volume, unseen: NDArray[np.bool_] | None = None) -> Iterator[Volume]:
+        """All blocks, in parts that fit."""
+        return self._tiles(grid, unseen, np.zeros(3, np.int64), np.array(grid.blocks))
+
+    def _tiles(
+        self, grid: Volume, unseen: NDArray[np.bool_] | None, low: NDArray[np.int64], high: NDArray[np.int64]
+    ) -> Iterator[Volume]:
         """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
         # A block more on every side for the smoothing, and one at the far side, of which the last cells take their samples.
         wide = [np.maximum(low - 1, 0).tolist(), np.minimum(high + 2, grid.blocks).tolist()]
@@ -219,14 +234,14 @@ class _Fusion:
         middle = (low[axis] + high[axis]) // 2
         halves = [(low, np.where(np.arange(3) == axis, middle, high)), (np.where(np.arange(3) == axis, middle, low), high)]
         try:
-            found = None if self._is_wide(grid, (low, high), halves) else self.run(grid, wide, hollow=True)
+            found = None if self._is_wide(grid, (low, high), halves) else self.run(grid, wide, hollow=True, unseen=unseen)
         except MemoryError as error:
             found = None
             if high[axis] - low[axis] < 2:
                 raise ReconstructionError(f"max_memory = {self.config.max_memory} bytes is too little for a volume: {error}") from None
         if found is None:
             for part in halves:
-                yield from self.tiles(grid, *part)
+                yield from self._tiles(grid, unseen, *part)
             return
         kept = ((found.coords >= low) & (found.coords <= high)).all(1)
         coords, values = found.coords[kept], found.values[kept]
@@ -286,6 +301,7 @@ def fuse_tiles(
     report: Report | None = None,
     windows: Sequence[Window] | None = None,
     found: Sequence[NDArray[np.uint8]] | None = None,
+    unseen_reach: float | None = None,
 ) -> Iterator[Volume]:
     """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out. Blocks deep
     inside the masks' hull are left out.
@@ -297,14 +313,18 @@ def fuse_tiles(
         reads from disk holds only the maps of the views that may see the tile.
     found : silhouettes that were found in the photographs, instead of masks: their hull stands in where no depth map reaches, and cuts
         nothing.
+    unseen_reach : with masks, voxels from what a camera sees beyond which the hull is not made where nothing was measured: the surface
+        is open there. None makes all of it.
     """
     config, report = config or VolumeConfig(), report or Report()
     job = _Fusion.of(depths, cameras, bounds, masks, config, windows, found)
     grid = job.grid(job.voxel)
 
     def told() -> Iterator[Volume]:
-        parts = []
-        for part in job.tiles(grid, np.zeros(3, np.int64), np.array(grid.blocks)):
+        parts, unseen = [], None
+        if masks is not None and unseen_reach is not None:
+            unseen = unseen_blocks(job.tiles(job.grid(COARSE * job.voxel)), cameras, grid, unseen_reach)
+        for part in job.tiles(grid, unseen):
             if len(part.coords):
                 parts.append((len(part.coords), part.values.nbytes))
                 yield part
@@ -318,6 +338,10 @@ def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:
         raise ReconstructionError("no surface lies inside the bounds: check the bounds, the masks and the depth maps")
     blocks, most = sum(p[0] for p in parts), max(p[1] for p in parts)
     report.values["volume"] = {"voxel": grid.voxel, "shape": list(grid.shape), "blocks": blocks, "bytes": most, "tiles": len(parts)}
+
+
+def _slices(blocks: NDArray[Any]) -> tuple[slice, ...]:
+    return tuple(slice(int(low), int(high)) for low, high in blocks.T)
 
 
 _NOTHING = np.zeros((1, 1), np.float32)

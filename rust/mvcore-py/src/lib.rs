@@ -31,8 +31,8 @@ mod _core {
     use crate::texture::{Atlas, compare_views, keep_best, rasterize, rate_faces, select_views, shade};
     #[pymodule_export]
     use crate::volume::{
-        carve, close_holes, components, consistency, distance_transform, fuse, isosurface_dense, isosurface_sparse,
-        nearest, photo_carve,
+        carve, close_holes, components, consistency, decimate, distance_transform, fuse, isosurface_dense,
+        isosurface_sparse, nearest, photo_carve,
     };
 
     #[pymodule_init]

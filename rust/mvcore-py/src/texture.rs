@@ -131,14 +131,15 @@ pub fn select_views<'py>(
     qualities: PyReadwriteArray2<'py, f32>,
     colours: PyReadwriteArray3<'py, u8>,
     gains: PyReadonlyArray2<'py, f32>,
+    unit: f64,
     seam: f32,
     outlier: f32,
-    least_patch: usize,
+    least_patch: f64,
 ) -> PyResult<Bound<'py, PyArray1<i32>>> {
     let ((v, f), gains) = (mesh(&vertices, &faces)?, rows::<3, _>(&gains, "gains")?);
     let mut lists = Lists(views, qualities, colours);
     let mut lists = lists.borrow(py)?;
-    let params = SelectParams { seam, outlier, least_patch };
+    let params = SelectParams { seam, unit, outlier, least_patch };
     let labels = run(py, || mvcore::select_views::select_views(Mesh::new(v, f)?, &mut lists, gains, &params))?;
     let n = labels.len();
     array(py, labels, [n])

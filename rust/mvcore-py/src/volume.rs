@@ -61,7 +61,7 @@ pub fn distance_transform<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, truncation, free_weight, min_weight, solid_weight, smoothing, measured_smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, unseen = None, truncation, free_weight, min_weight, solid_weight, smoothing, measured_smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -73,6 +73,7 @@ pub fn fuse<'py>(
     windows: Vec<[f64; 4]>,
     projections: PyReadonlyArray3<'py, f64>,
     tile: Option<[[usize; 3]; 2]>,
+    unseen: Option<PyReadonlyArray3<'py, bool>>,
     truncation: f64,
     free_weight: f32,
     min_weight: f32,
@@ -124,10 +125,11 @@ pub fn fuse<'py>(
         hollow,
         max_memory,
     };
+    let unseen = unseen.as_ref().map_or(Ok(&[][..]), |flags| slice(flags, "unseen"))?;
     let volume = run(py, || {
         let grid = Grid::new(origin, voxel, shape)?;
         let tile = tile.map_or(Tile::whole(&grid), |[low, high]| Tile { low, high });
-        mvcore::fuse::fuse_tile(grid, tile, &views, &params)
+        mvcore::fuse::fuse_tile(grid, tile, &views, &params, unseen)
     })?;
     let count = volume.map.coords.len();
     Ok((
@@ -265,6 +267,24 @@ pub fn close_holes<'py>(
     let added = run(py, kernel)?;
     let n = added.len();
     array(py, added.into_flattened(), [n, 3])
+}
+
+/// Vertices, some moved and some without a face, and the faces that are left within an error bound.
+#[pyfunction]
+#[pyo3(signature = (vertices, faces, error, most_faces = usize::MAX))]
+pub fn decimate<'py>(
+    py: Python<'py>,
+    vertices: PyReadonlyArray2<'py, f64>,
+    faces: PyReadonlyArray2<'py, u32>,
+    error: f64,
+    most_faces: usize,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
+    let (vertices, faces) = (rows::<3, _>(&vertices, "vertices")?, rows::<3, _>(&faces, "faces")?);
+    finite(py, "vertices", vertices.as_flattened().iter().copied())?;
+    let kernel = || mvcore::decimate::decimate(mvcore::mesh::Mesh::new(vertices, faces)?, error, most_faces);
+    let left = run(py, kernel)?;
+    let (v, f) = (left.vertices.len(), left.faces.len());
+    Ok((array(py, left.vertices.into_flattened(), [v, 3])?, array(py, left.faces.into_flattened(), [f, 3])?))
 }
 
 #[pyfunction]

@@ -86,11 +86,18 @@ const VOXEL_BYTES: usize = 8;
 
 /// Fuses the views into the blocks near their surfaces (with silhouettes: also all blocks inside the hull).
 pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<Volume> {
-    fuse_tile(grid, Tile::whole(&grid), views, params)
+    fuse_tile(grid, Tile::whole(&grid), views, params, &[])
 }
 
-/// The same for the blocks of a tile; those on its sides lack what smoothing takes from beyond them.
-pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionParams) -> Result<Volume> {
+/// The same for the blocks of a tile; those on its sides lack what smoothing takes from beyond them. Where `params.hollow` holds, blocks
+/// in which no view has a surface are left out if `unseen` says so, one flag a block of the tile or none at all.
+pub fn fuse_tile(
+    grid: Grid,
+    tile: Tile,
+    views: &[FusionView],
+    params: &FusionParams,
+    unseen: &[bool],
+) -> Result<Volume> {
     let dims = grid.blocks();
     let fits = (0..3).all(|a| tile.low[a] < tile.high[a] && tile.high[a] <= dims[a]);
     require(fits, "tile", format!("a box of blocks within {dims:?}"), format!("{:?} to {:?}", tile.low, tile.high))?;
@@ -106,6 +113,7 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
         )?;
     }
     let count = tile.count();
+    require(unseen.is_empty() || unseen.len() == count, "unseen", format!("{count} flags or none"), unseen.len())?;
     // A slot and three flags a block.
     let table = count.saturating_mul(7);
     if table > params.max_memory {
@@ -128,11 +136,17 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
     }
     let tiles: Vec<Tiles> = views.par_iter().map(Tiles::of).collect();
     let mut flags: Vec<bool> = flags.into_iter().map(AtomicBool::into_inner).collect();
-    let mut inside = vec![false; count];
+    let mut held = vec![1i8; count];
     if hull == Hull::Cuts && params.hollow {
         let contents = contents(&grid, &tile, views, &tiles, &silhouettes, params, &flags);
-        flags = (0..count).into_par_iter().map(|n| flags[n] && !amid(&tile, n, &contents)).collect();
-        inside = contents.iter().map(|&c| c == Content::Solid).collect();
+        let left_out = |n: usize| unseen.get(n) == Some(&true) && contents[n] != Content::Measured;
+        let holds = |n: usize| match contents[n] {
+            Content::Solid => -1,
+            _ if flags[n] && left_out(n) => 0,
+            _ => 1,
+        };
+        held = (0..count).map(holds).collect();
+        flags = (0..count).into_par_iter().map(|n| flags[n] && !left_out(n) && !amid(&tile, n, &contents)).collect();
     }
     let map = BlockMap::from_flags(tile, flags.into_iter());
     let needed = map.coords.len() * (BLOCK * VOXEL_BYTES + size_of::<Bits>()) + table;
@@ -167,7 +181,7 @@ pub fn fuse_tile(grid: Grid, tile: Tile, views: &[FusionView], params: &FusionPa
     interrupt.poll();
     if params.smoothing > 0.0 {
         // With silhouettes what no block covers is outside the hull.
-        let beyond = if hull == Hull::Cuts { Beyond::Outside(&inside) } else { Beyond::Unknown };
+        let beyond = if hull == Hull::Cuts { Beyond::Held(&held) } else { Beyond::Unknown };
         let measured = (hull == Hull::Cuts && params.measured_smoothing > 0.0)
             .then_some(Measured { bits: &bits, sigma: params.measured_smoothing });
         values = smooth(&values, &map, params.smoothing, beyond, measured);
@@ -195,6 +209,8 @@ enum Content {
     Free,
     /// -1: deep inside the hull, and what sees through it is too little to overrule that.
     Solid,
+    /// A view has a surface in it.
+    Measured,
     /// Different values, or nobody knows without asking each voxel.
     Mixed,
 }
@@ -223,7 +239,7 @@ fn contents(
                     least += params.free_weight * weights[0];
                     most += params.free_weight * weights[1];
                 }
-                Says::Surface => return Content::Mixed,
+                Says::Surface => return Content::Measured,
             }
         }
         // Sums in another order differ in their last digits.
@@ -246,7 +262,7 @@ fn amid(tile: &Tile, n: usize, contents: &[Content]) -> bool {
     let same = |content: Content| match contents[n] {
         Content::Solid => content == Content::Solid,
         Content::Free => matches!(content, Content::Free | Content::Outside),
-        Content::Outside | Content::Mixed => false,
+        Content::Outside | Content::Measured | Content::Mixed => false,
     };
     let at = tile.block(n);
     (0..27).all(|k| {
@@ -693,7 +709,7 @@ mod tests {
         let params = FusionParams { smoothing: 1.5, ..PARAMS };
         let grid = Grid::new([-1.0; 3], 0.03, [67; 3]).unwrap();
         let whole = fuse(grid, &[view], &params).unwrap();
-        let part = fuse_tile(grid, Tile { low: [2, 1, 0], high: [7, 6, 9] }, &[view], &params).unwrap();
+        let part = fuse_tile(grid, Tile { low: [2, 1, 0], high: [7, 6, 9] }, &[view], &params, &[]).unwrap();
         let mut inner = 0;
         for (c, block) in part.map.coords.iter().zip(part.values.chunks_exact(BLOCK)) {
             // One block from the tile's sides all that smoothing reads is there.
@@ -707,7 +723,7 @@ mod tests {
         }
         assert!(inner > 10);
         let wrong = Tile { low: [0; 3], high: [10, 9, 9] };
-        assert!(fuse_tile(grid, wrong, &[view], &params).unwrap_err().to_string().starts_with("tile"));
+        assert!(fuse_tile(grid, wrong, &[view], &params, &[]).unwrap_err().to_string().starts_with("tile"));
     }
 
     #[test]

@@ -13,6 +13,7 @@ pub mod compare_views;
 pub mod consistency;
 pub mod correlate;
 pub mod cube;
+pub mod decimate;
 pub mod distance_transform;
 pub mod error;
 pub mod expect;

@@ -26,7 +26,7 @@ impl<'a> Mesh<'a> {
             format!("vertex numbers below {n}"),
             worst.unwrap_or_default(),
         )?;
-        require(i32::try_from(faces.len()).is_ok(), "faces", "fewer than 2^31", faces.len())?;
+        require(faces.len() < 1 << 30, "faces", "fewer than 2^30", faces.len())?;
         Ok(Self { vertices, faces })
     }
 
@@ -61,22 +61,34 @@ pub fn project(m: &[f64; 12], p: [f64; 3]) -> [f64; 3] {
 
 /// For each face the faces beyond its edges (0-1, 1-2, 2-0), [`NOTHING`] at a border or where three or more meet.
 pub fn neighbours(faces: &[[u32; 3]]) -> Vec<[i32; 3]> {
-    let mut sides: Vec<(u64, u32)> = faces
-        .par_iter()
-        .enumerate()
-        .flat_map_iter(|(n, f)| {
-            (0..3).map(move |e| {
-                let (a, b) = (f[e], f[(e + 1) % 3]);
-                ((u64::from(a.min(b)) << 32) | u64::from(a.max(b)), (3 * n + e) as u32)
-            })
-        })
-        .collect();
-    sides.par_sort_unstable();
+    let vertices = faces.par_iter().map(|f| f[0].max(f[1]).max(f[2])).max().map_or(0, |v| v as usize + 1);
+    // The sides (higher vertex, number) of each lower vertex, in one array: a counting sort.
+    let ends = |side: usize| {
+        let (a, b) = (faces[side / 3][side % 3], faces[side / 3][(side + 1) % 3]);
+        (a.min(b) as usize, a.max(b))
+    };
+    let mut first = vec![0u32; vertices + 1];
+    (0..3 * faces.len()).for_each(|side| first[ends(side).0] += 1);
+    let mut sum = 0;
+    for f in &mut first {
+        sum += *f;
+        *f = sum;
+    }
+    let mut sides = vec![(0u32, 0u32); 3 * faces.len()];
+    for side in (0..sides.len()).rev() {
+        let (low, high) = ends(side);
+        first[low] -= 1;
+        sides[first[low] as usize] = (high, side as u32);
+    }
     let mut out = vec![[NOTHING; 3]; faces.len()];
-    for group in sides.chunk_by(|a, b| a.0 == b.0) {
-        if let [(_, p), (_, q)] = *group {
-            out[p as usize / 3][p as usize % 3] = (q / 3) as i32;
-            out[q as usize / 3][q as usize % 3] = (p / 3) as i32;
+    for range in first.windows(2) {
+        let group = &mut sides[range[0] as usize..range[1] as usize];
+        group.sort_unstable();
+        for same in group.chunk_by(|a, b| a.0 == b.0) {
+            if let [(_, p), (_, q)] = *same {
+                out[p as usize / 3][p as usize % 3] = (q / 3) as i32;
+                out[q as usize / 3][q as usize % 3] = (p / 3) as i32;
+            }
         }
     }
     out

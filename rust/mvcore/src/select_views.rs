@@ -17,12 +17,14 @@ use rayon::prelude::*;
 /// How to label.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SelectParams {
-    /// Cost of a seam along one edge, relative to the span of data costs (1).
+    /// Cost of a seam, a `unit` of its length, relative to the span of data costs of a square unit (1).
     pub seam: f32,
+    /// Length by which seams and areas are measured, world units: energies do not depend on how the surface is cut into faces.
+    pub unit: f64,
     /// Grey levels by which a view's colour may differ from the median of the list; 0 turns the check off.
     pub outlier: f32,
-    /// Patches of fewer faces take a neighbouring patch's view where that one sees them.
-    pub least_patch: usize,
+    /// Patches of less area (square units) take a neighbouring patch's view where that one sees them.
+    pub least_patch: f64,
 }
 
 /// Rounds of spreading quality before the first labels are taken.
@@ -41,6 +43,7 @@ pub fn select_views(mesh: Mesh, lists: &mut Candidates, gains: &[[f32; 3]], para
     let n = mesh.faces.len();
     require(lists.len() == n, "views", format!("lists of {n} faces"), lists.len())?;
     lists.check(gains.len())?;
+    require(params.unit > 0.0, "unit", "more than 0", params.unit)?;
     let around = neighbours(mesh.faces);
     if params.outlier > 0.0 {
         reject_outliers(lists, gains, params.outlier);
@@ -50,13 +53,13 @@ pub fn select_views(mesh: Mesh, lists: &mut Candidates, gains: &[[f32; 3]], para
     let interrupt = Interrupt::current();
     for _ in 0..SWEEPS {
         interrupt.poll();
-        if !sweep(lists, &around, scale, params.seam, &mut labels) {
+        if !sweep(mesh, lists, &around, scale, params, &mut labels) {
             break;
         }
     }
     for _ in 0..MERGES {
         interrupt.poll();
-        if !merge_small(lists, &around, params.least_patch, &mut labels) {
+        if !merge_small(mesh, lists, &around, params, &mut labels) {
             break;
         }
     }
@@ -147,7 +150,14 @@ fn spread(lists: &Candidates, around: &[[i32; 3]], view: i32, members: &[u32], p
 }
 
 /// One round of iterated conditional modes; whether a label changed.
-fn sweep(lists: &Candidates, around: &[[i32; 3]], scale: f32, seam: f32, labels: &mut [i32]) -> bool {
+fn sweep(
+    mesh: Mesh,
+    lists: &Candidates,
+    around: &[[i32; 3]],
+    scale: f32,
+    params: &SelectParams,
+    labels: &mut [i32],
+) -> bool {
     let mut changed = false;
     for f in 0..around.len() {
         let now = labels[f];
@@ -156,9 +166,11 @@ fn sweep(lists: &Candidates, around: &[[i32; 3]], scale: f32, seam: f32, labels:
         if now == NOTHING || others.iter().all(|&v| v == NOTHING || v == now) {
             continue;
         }
+        let area = area(mesh, f, params.unit) as f32;
+        let lengths = lengths(mesh.corners(f), params.unit);
         let cost = |v: i32, quality: f32| {
-            let seams = others.iter().filter(|&&o| o != NOTHING && o != v).count() as f32;
-            1.0 - (quality * scale).min(1.0) + seam * seams
+            let seams: f32 = others.iter().zip(lengths).filter(|&(&o, _)| o != NOTHING && o != v).map(|(_, l)| l).sum();
+            area * (1.0 - (quality * scale).min(1.0)) + params.seam * seams
         };
         let mut best = (now, cost(now, lists.quality(f, now)));
         for v in others.into_iter().filter(|&v| v != NOTHING && v != now) {
@@ -174,16 +186,29 @@ fn sweep(lists: &Candidates, around: &[[i32; 3]], scale: f32, seam: f32, labels:
     changed
 }
 
+/// Area of a face in square units.
+fn area(mesh: Mesh, face: usize, unit: f64) -> f64 {
+    0.5 * mesh.normal(face).iter().map(|x| x * x).sum::<f64>().sqrt() / (unit * unit)
+}
+
+/// Lengths of the sides 0-1, 1-2, 2-0 of a triangle in units.
+fn lengths(corners: [[f64; 3]; 3], unit: f64) -> [f32; 3] {
+    std::array::from_fn(|e| {
+        let (p, q) = (corners[e], corners[(e + 1) % 3]);
+        ((0..3).map(|k| (p[k] - q[k]).powi(2)).sum::<f64>().sqrt() / unit) as f32
+    })
+}
+
 /// Gives small patches to the neighbouring view that sees most of them; whether a label changed.
-fn merge_small(lists: &Candidates, around: &[[i32; 3]], least: usize, labels: &mut [i32]) -> bool {
+fn merge_small(mesh: Mesh, lists: &Candidates, around: &[[i32; 3]], params: &SelectParams, labels: &mut [i32]) -> bool {
     let (part, count) = components(around, |f, g| labels[f] == labels[g]);
-    let mut size = vec![0usize; count];
-    for &p in &part {
-        size[p as usize] += 1;
+    let mut size = vec![0.0; count];
+    for (f, &p) in part.iter().enumerate() {
+        size[p as usize] += area(mesh, f, params.unit);
     }
     let mut changed = false;
     for f in 0..around.len() {
-        if size[part[f] as usize] >= least || labels[f] == NOTHING {
+        if size[part[f] as usize] >= params.least_patch || labels[f] == NOTHING {
             continue;
         }
         let better = around[f]
@@ -191,7 +216,7 @@ fn merge_small(lists: &Candidates, around: &[[i32; 3]], least: usize, labels: &m
             .filter(|&&g| g != NOTHING)
             .map(|&g| g as usize)
             .filter(|&g| labels[g] != NOTHING && labels[g] != labels[f] && lists.quality(f, labels[g]) > 0.0)
-            .max_by_key(|&g| (size[part[g] as usize], std::cmp::Reverse(g)));
+            .max_by(|&g, &h| size[part[g] as usize].total_cmp(&size[part[h] as usize]).then(h.cmp(&g)));
         if let Some(g) = better
             && size[part[g] as usize] > size[part[f] as usize]
         {
@@ -213,7 +238,7 @@ mod tests {
         (vertices, faces)
     }
 
-    const PARAMS: SelectParams = SelectParams { seam: 0.5, outlier: 40.0, least_patch: 4 };
+    const PARAMS: SelectParams = SelectParams { seam: 0.25, unit: 1.0, outlier: 40.0, least_patch: 2.0 };
 
     /// Labels from the quality and grey level of each view of each face.
     fn label(mesh: Mesh, count: usize, rating: impl Fn(usize, usize) -> (f32, u8), gains: &[[f32; 3]]) -> Vec<i32> {

@@ -28,8 +28,8 @@ const WIDE: usize = SIDE + 2 * HALO;
 pub enum Beyond<'a> {
     /// Nothing is known of them: the surface is open.
     Unknown,
-    /// 1, outside; but -1, inside, where the flag of the tile's block is set.
-    Outside(&'a [bool]),
+    /// For each block of the tile 1, outside, -1, inside, or 0, not known; outside beyond the tile.
+    Held(&'a [i8]),
 }
 
 /// A block's voxels, a bit each.
@@ -57,7 +57,7 @@ fn taps(sigma: f32) -> Taps {
 pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measured: Option<Measured>) -> Vec<f32> {
     let wide_taps = taps(sigma);
     // Open surfaces have free space on one side and nothing behind: far values must not outweigh the surface's own.
-    let least = if matches!(beyond, Beyond::Outside(_)) { 1.0 } else { FAR_WEIGHT };
+    let least = if matches!(beyond, Beyond::Held(_)) { 1.0 } else { FAR_WEIGHT };
     let mut out = zeroed::<f32>(values.len());
     let interrupt = Interrupt::current();
     out.par_chunks_exact_mut(BLOCK).zip(map.coords.par_iter()).enumerate().for_each_init(
@@ -66,7 +66,7 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measur
             if interrupt.is_set() {
                 return;
             }
-            wide.fill(if matches!(beyond, Beyond::Outside(_)) { [1.0, 1.0] } else { [0.0; 2] });
+            wide.fill(if matches!(beyond, Beyond::Held(_)) { [1.0, 1.0] } else { [0.0; 2] });
             gather(values, map, *at, least, beyond, wide);
             let values = &values[slot * BLOCK..][..BLOCK];
             // How much of each voxel's surroundings was measured decides which of the two Gaussians a block needs.
@@ -99,8 +99,12 @@ pub fn smooth(values: &[f32], map: &BlockMap, sigma: f32, beyond: Beyond, measur
 fn gather(values: &[f32], map: &BlockMap, at: [u32; 3], least: f32, beyond: Beyond, wide: &mut [[f32; 2]]) {
     rows_around(map, at, |index, slot, to, from| {
         let from = match (slot, beyond) {
-            (NONE, Beyond::Outside(inside)) if inside[index] => &[-1.0; BLOCK][from],
-            (NONE, _) => return,
+            (NONE, Beyond::Held(held)) => {
+                let value = f32::from(held[index]);
+                wide[to..][..from.len()].fill([value, value.abs()]);
+                return;
+            }
+            (NONE, Beyond::Unknown) => return,
             _ => &values[slot as usize * BLOCK..][from],
         };
         for (out, &v) in wide[to..].iter_mut().zip(from) {
@@ -212,8 +216,8 @@ mod tests {
         let map = BlockMap::from_flags(Tile { low: [0; 3], high: [3; 3] }, std::iter::repeat_n(true, 27));
         let values: Vec<f32> =
             (0..27 * BLOCK as u32).map(|n| (n.wrapping_mul(2654435761) >> 24) as f32 / 255.0 - 0.5).collect();
-        let outside = vec![false; 27];
-        let run = |sigma, measured| smooth(&values, &map, sigma, Beyond::Outside(&outside), measured);
+        let outside = vec![1; 27];
+        let run = |sigma, measured| smooth(&values, &map, sigma, Beyond::Held(&outside), measured);
         let (all, none) = (vec![[u64::MAX; BLOCK / 64]; 27], vec![Bits::default(); 27]);
         let mixed = |bits| run(2.0, Some(Measured { bits, sigma: 0.7 }));
         let (wide, narrow) = (run(2.0, None), run(0.7, None));
