@@ -172,8 +172,8 @@ fn volumes(c: &mut Criterion) {
     let weight = vec![1.0f32; w * h];
     let raster = |d| Raster::new(d, w, h, "depth").unwrap();
     let view = |k| FusionView {
-        depth: raster(&depth),
-        weight: raster(&weight),
+        depth: raster(&depth).into(),
+        weight: raster(&weight).into(),
         silhouette: None,
         window: [0.0, 0.0, (w - 1) as f64, (h - 1) as f64],
         projection: ring(24, k, w, h, focal).0,
@@ -197,8 +197,10 @@ fn volumes(c: &mut Criterion) {
     let border = focal / 8f64.sqrt();
     let away = |n: usize| (((n % w) as f64 - 319.5).hypot((n / w) as f64 - 239.5) - border) as f32;
     let soft: Vec<f32> = (0..w * h).map(away).collect();
-    let hulls: Vec<_> =
-        views.iter().map(|v| FusionView { depth: raster(&none), silhouette: Some(raster(&soft)), ..*v }).collect();
+    let hulls: Vec<_> = views
+        .iter()
+        .map(|v| FusionView { depth: raster(&none).into(), silhouette: Some(raster(&soft).into()), ..*v })
+        .collect();
     group.bench_function("hull field of 24 soft silhouettes in 256^3", |b| {
         b.iter(|| fuse(grid, &hulls, &FUSION).unwrap());
     });
@@ -227,7 +229,7 @@ fn volumes(c: &mut Criterion) {
     group.bench_function("fuse 24 maps 640x480 into 256^3", |b| b.iter(|| fuse(grid, &views, &FUSION).unwrap()));
     let smooth = FusionParams { smoothing: 0.7, ..FUSION };
     group.bench_function("the same, smoothed", |b| b.iter(|| fuse(grid, &views, &smooth).unwrap()));
-    let masked: Vec<_> = views.iter().map(|v| FusionView { silhouette: Some(raster(&soft)), ..*v }).collect();
+    let masked: Vec<_> = views.iter().map(|v| FusionView { silhouette: Some(raster(&soft).into()), ..*v }).collect();
     let wide = FusionParams { smoothing: 2.0, measured_smoothing: 0.7, ..FUSION };
     group.bench_function("the same cut by silhouettes, smoothed where it was not measured", |b| {
         b.iter(|| fuse(grid, &masked, &wide).unwrap());

@@ -561,12 +561,10 @@ def test_a_hull_that_no_camera_sees_is_not_made_and_what_one_sees_stays_the_same
     maps = [DepthMap(np.where(half, d, 0).astype(np.float32), (half & (d > 0)).astype(np.float32)) for d in depths]
     masks = [(d > 0).astype(np.uint8) * 255 for d in depths]
     bounds, config = np.array([[-0.9] * 3, [0.9] * 3]), VolumeConfig(voxel=0.006)
-    whole, part = (
-        list(fuse_tiles(maps, cameras, bounds, masks, config, unseen_reach=reach)) for reach in (None, 1.0)
-    )
+    whole, part = (list(fuse_tiles(maps, cameras, bounds, masks, config, unseen_reach=reach)) for reach in (None, 1.0))
     assert sum(len(v.coords) for v in part) < 0.75 * sum(len(v.coords) for v in whole)
-    full, less = isosurface(whole), isosurface(part)
-    seen = drop_unseen(full, cameras, config.voxel, 1.0)
+    full = isosurface(whole)
+    seen, less = (drop_unseen(s, cameras, config.voxel, 1.0) for s in (full, isosurface(part)))
     missing, _ = _core.nearest(seen.vertices, np.ascontiguousarray(less.vertices))
     assert len(seen.vertices) > 10_000
     assert (missing < 1e-9).mean() > 0.99

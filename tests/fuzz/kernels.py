@@ -142,7 +142,15 @@ def calls() -> dict[str, Arguments]:
         "rate_faces": {**mesh, **photo},
         "keep_best": {"view": 1, "quality": np.ones(2, np.float32), "colour": np.zeros((2, 3), np.uint8), **lists},
         "compare_views": {**lists, "count": 2, "sample": 16},
-        "select_views": {**mesh, **lists, "gains": np.ones((2, 3), np.float32), "unit": 1.0, "seam": 1.0, "outlier": 3.0, "least_patch": 2.0},
+        "select_views": {
+            **mesh,
+            **lists,
+            "gains": np.ones((2, 3), np.float32),
+            "unit": 1.0,
+            "seam": 1.0,
+            "outlier": 3.0,
+            "least_patch": 2.0,
+        },
         "shade": {**mesh, **lit, "lamp": (0.0, 0.0, -1.0), "width": W, "height": H, "samples": 1},
         "atlas": {**mesh, **labels, "image": rgb(), "gains": np.ones((1, 3), np.float32)},
     }

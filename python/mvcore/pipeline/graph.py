@@ -169,9 +169,7 @@ def frame_tasks(
     rig = Rig(views.cameras, views.windows, views.masked, plan.box, any(plan.sources))
     used = [n for n, s in enumerate(plan.sources) if s]
     rough = {n: _matched(views, plan, n, before.prediction, config) for n in used}
-    field_ = FieldSettings(
-        config.volume, config.carve, config.standing, config.surface.min_component, config.surface.unseen_reach
-    )
+    field_ = FieldSettings(config.volume, config.carve, config.standing, config.surface.min_component, config.surface.unseen_reach)
     third_pass = bool(config.depth.surface_rounds)
     second = {n: _refined(views, plan, n, rough, config, last=not third_pass) for n in used}
     draft, draft_loose, third = None, {}, second

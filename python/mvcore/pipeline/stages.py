@@ -458,9 +458,7 @@ def _field(
     masks = _Masks(pixels) if rig.masked else None
     if rig.stereo:
         outlines = None if completion is None else completion.silhouettes
-        yield from fuse_tiles(
-            depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines, settings.unseen_reach
-        )
+        yield from fuse_tiles(depths, rig.cameras, rig.box, masks, settings.volume, report, rig.windows, outlines, settings.unseen_reach)
     elif settings.carve.photo_consistency:
         assert masks is not None
         hull = visual_hull(list(masks), rig.cameras, rig.box, settings.volume, report, rig.windows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from ..geometry.cameras import Camera
 from ..geometry.rig import box_depth, corners
 from ..silhouettes.occluder_repair import repaired_masks
 from ..types import Bounds, DepthMap, Report
+from . import coarse
 from .hull_prior import _open_share, hull_share, silhouette_distance
-from .unseen import COARSE, unseen_blocks
 
 Window = tuple[float, float, float, float]
 """x0, y0, x1, y1 in pixels of an image that may be a part of what the camera saw."""
@@ -98,6 +98,32 @@ _Blocks = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Block coordinates from the first up to the second."""
 
 
+@dataclass
+class _Maps:
+    """Depth, weights and silhouette's distance of each view, or a rectangle of them.
+
+    cuts : left, top, and the whole map's width and height.
+    """
+
+    depths: list[NDArray[np.float32]] = field(default_factory=list)
+    weights: list[NDArray[np.float32]] = field(default_factory=list)
+    silhouettes: list[NDArray[np.float32]] = field(default_factory=list)
+    cuts: list[tuple[int, int, int, int]] = field(default_factory=list)
+
+    def add(
+        self,
+        depth: NDArray[np.float32],
+        weight: NDArray[np.float32],
+        silhouette: NDArray[np.float32],
+        cut: tuple[int, int, int, int],
+    ) -> None:
+        """Append a view."""
+        self.depths.append(depth)
+        self.weights.append(weight)
+        self.silhouettes.append(silhouette)
+        self.cuts.append(cut)
+
+
 @dataclass(frozen=True)
 class _Fusion:
     """What the tiles of a fusion share: little beside the views' maps, which are read when a tile needs them."""
@@ -153,32 +179,45 @@ class _Fusion:
         nothing = np.zeros((0, 3), np.uint32), np.zeros((0, SIDE, SIDE, SIDE), np.float32)
         return Volume(self.bounds[0] - 2 * voxel, voxel, (nx, ny, nz), *nothing)
 
+    def coarse(self, grid: Volume) -> Iterator[Volume]:
+        """The same field at some of the grid's samples, in parts."""
+        n = coarse.COARSE
+        nx, ny, nz = (-(-count // n) + 1 for count in grid.shape)
+        config = replace(
+            self.config,
+            truncation=max(1.0, self.config.truncation / n),
+            smoothing=self.config.smoothing / n,
+            solid_smoothing=self.config.solid_smoothing / n,
+        )
+        return replace(self, config=config).tiles(replace(grid, voxel=n * grid.voxel, shape=(nx, ny, nz)))
+
     def run(
         self,
         grid: Volume,
         tile: list[list[int]] | None = None,
         hollow: bool = False,
-        unseen: NDArray[np.bool_] | None = None,
+        hints: NDArray[np.int8] | None = None,
     ) -> Volume:
         """The field, or the blocks from tile[0] up to tile[1]; MemoryError beyond ``max_memory``.
 
-        ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes, and blocks
-        without measured surface that ``unseen`` flags, (nx, ny, nz) of the whole grid.
+        ``hollow`` leaves out what lies so deep inside masks' hull that no surface passes; ``hints``
+        of a coarser field, (nx, ny, nz) of the whole grid, help to tell.
         """
         config = self.config
         blocks = np.array([[0, 0, 0], grid.blocks] if tile is None else tile)
-        depths, weights, silhouettes = self._maps(grid.origin + SIDE * grid.voxel * blocks)
+        maps = self._maps(grid.origin + SIDE * grid.voxel * blocks, grid.voxel)
         coords, values = _core.fuse(
             grid.origin.tolist(),
             grid.voxel,
             list(grid.shape),
-            depths,
-            weights,
-            None if self.outlines is None else silhouettes,
+            maps.depths,
+            maps.weights,
+            None if self.outlines is None else maps.silhouettes,
             self.windows,
             np.stack([c.projection for c in self.cameras]),
             tile=tile,
-            unseen=None if unseen is None else np.ascontiguousarray(unseen[_slices(blocks)]),
+            cuts=maps.cuts,
+            hints=None if hints is None else np.ascontiguousarray(hints[_slices(blocks)]),
             truncation=config.truncation * grid.voxel,
             free_weight=config.free_weight,
             min_weight=config.min_weight,
@@ -192,41 +231,59 @@ class _Fusion:
         )
         return replace(grid, coords=coords, values=values)
 
-    def _maps(self, box: Bounds) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]], list[NDArray[np.float32]]]:
-        """Depth, weights and silhouette's distance of each view that a box may be seen in; a pixel that says nothing of the others."""
-        depths, weights, silhouettes = [], [], []
+    def _maps(self, box: Bounds, voxel: float) -> _Maps:
+        """What the views that may see a box show of it; a pixel that says nothing of the others."""
+        maps = _Maps()
         for n, (camera, window) in enumerate(zip(self.cameras, self.windows, strict=True)):
-            if _may_see(camera, window, box):
-                view = self.depths[n]
-                depths.append(view.depth)
-                weights.append(_weights(view, self.scales[n]))
-                silhouettes.append(_NOTHING if self.outlines is None else silhouette_distance(self.outlines[n]))
-            else:
-                depths.append(_NOTHING)
-                weights.append(_NOTHING)
-                silhouettes.append(_NOTHING)
-        return depths, weights, silhouettes
+            if not _may_see(camera, window, box):
+                maps.add(_NOTHING, _NOTHING, _NOTHING, (0, 0, 1, 1))
+                continue
+            x0, y0, x1, y1 = _rectangle(camera, box)
+            view = self.depths[n]
+            part = DepthMap(_part(view.depth, x0, y0, x1, y1), _part(view.confidence, x0, y0, x1, y1))
+            outline = _NOTHING
+            if self.outlines is not None:
+                outline = self._outline(n, box, voxel, (x0, y0, x1, y1))
+            maps.add(part.depth, _weights(part, self.scales[n]), outline, (x0, y0, camera.width, camera.height))
+        return maps
+
+    def _outline(self, n: int, box: Bounds, voxel: float, part: tuple[int, int, int, int]) -> NDArray[np.float32]:
+        """Distance from a silhouette in a part of its view, exact as far as it matters in the box."""
+        assert self.outlines is not None
+        camera, (x0, y0, x1, y1) = self.cameras[n], part
+        nearest = camera.to_camera(corners(box))[:, 2].min()
+        mask = self.outlines[n]
+        if nearest <= 0:
+            return _part(silhouette_distance(mask), x0, y0, x1, y1)
+        # Nobody asks how far outside a block or beyond the truncation it is.
+        reach = (self.config.truncation + 3 * SIDE) * voxel * camera.K[0, 0] / nearest
+        margin = int(min(reach + 8, max(mask.shape)))
+        left, top = max(0, x0 - margin), max(0, y0 - margin)
+        distance = silhouette_distance(mask[top : y1 + margin, left : x1 + margin])
+        return _part(distance, x0 - left, y0 - top, x1 - left, y1 - top)
 
     def _map_bytes(self, grid: Volume, low: NDArray[np.int64], high: NDArray[np.int64]) -> int:
-        """Of the maps of all views that may see some blocks."""
+        """Of what the views show of some blocks."""
         box = grid.origin + SIDE * grid.voxel * np.stack([low - 1, high + 2])
-        seeing = [c for c, w in zip(self.cameras, self.windows, strict=True) if _may_see(c, w, box)]
-        return sum(c.width * c.height for c in seeing) * (8 if self.outlines is None else 12)
+        pixels = 0
+        for camera, window in zip(self.cameras, self.windows, strict=True):
+            if _may_see(camera, window, box):
+                x0, y0, x1, y1 = _rectangle(camera, box)
+                pixels += (x1 - x0) * (y1 - y0)
+        return pixels * (8 if self.outlines is None else 12)
 
     def _is_wide(self, grid: Volume, whole: _Blocks, halves: Sequence[_Blocks]) -> bool:
-        """Whether the maps of the views that see some blocks take too much memory, and fewer views see either half."""
+        """Whether what the views show of some blocks takes too much memory, and less for either half."""
         taken = self._map_bytes(grid, *whole)
-        if taken <= self.config.max_memory // 2 or (whole[1] - whole[0]).max() < 2:
+        if taken <= self.config.max_memory or (whole[1] - whole[0]).max() < 2:
             return False
         return all(self._map_bytes(grid, *half) < taken for half in halves)
 
-    def tiles(self, grid: Volume, unseen: NDArray[np.bool_] | None = None) -> Iterator[Volume]:
+    def tiles(self, grid: Volume, hints: NDArray[np.int8] | None = None) -> Iterator[Volume]:
         """All blocks, in parts that fit."""
-        return self._tiles(grid, unseen, np.zeros(3, np.int64), np.array(grid.blocks))
+        return self._tiles(grid, hints, np.zeros(3, np.int64), np.array(grid.blocks))
 
-    def _tiles(
-        self, grid: Volume, unseen: NDArray[np.bool_] | None, low: NDArray[np.int64], high: NDArray[np.int64]
-    ) -> Iterator[Volume]:
+    def _tiles(self, grid: Volume, hints: NDArray[np.int8] | None, low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[Volume]:
         """The blocks from ``low`` up to ``high``, cut in halves until each part fits."""
         # A block more on every side for the smoothing, and one at the far side, of which the last cells take their samples.
         wide = [np.maximum(low - 1, 0).tolist(), np.minimum(high + 2, grid.blocks).tolist()]
@@ -234,14 +291,14 @@ class _Fusion:
         middle = (low[axis] + high[axis]) // 2
         halves = [(low, np.where(np.arange(3) == axis, middle, high)), (np.where(np.arange(3) == axis, middle, low), high)]
         try:
-            found = None if self._is_wide(grid, (low, high), halves) else self.run(grid, wide, hollow=True, unseen=unseen)
+            found = None if self._is_wide(grid, (low, high), halves) else self.run(grid, wide, hollow=True, hints=hints)
         except MemoryError as error:
             found = None
             if high[axis] - low[axis] < 2:
                 raise ReconstructionError(f"max_memory = {self.config.max_memory} bytes is too little for a volume: {error}") from None
         if found is None:
             for part in halves:
-                yield from self._tiles(grid, unseen, *part)
+                yield from self._tiles(grid, hints, *part)
             return
         kept = ((found.coords >= low) & (found.coords <= high)).all(1)
         coords, values = found.coords[kept], found.values[kept]
@@ -321,10 +378,10 @@ def fuse_tiles(
     grid = job.grid(job.voxel)
 
     def told() -> Iterator[Volume]:
-        parts, unseen = [], None
+        parts, hints = [], None
         if masks is not None and unseen_reach is not None:
-            unseen = unseen_blocks(job.tiles(job.grid(COARSE * job.voxel)), cameras, grid, unseen_reach)
-        for part in job.tiles(grid, unseen):
+            hints = coarse.hints(job.coarse(grid), cameras, grid, unseen_reach)
+        for part in job.tiles(grid, hints):
             if len(part.coords):
                 parts.append((len(part.coords), part.values.nbytes))
                 yield part
@@ -356,6 +413,25 @@ def _may_see(camera: Camera, window: Window, box: Bounds) -> bool:
     low, high = (f(camera.project(corners(box)), axis=0) for f in (np.min, np.max))
     first, last = np.minimum(window[:2], 0) - 1, np.maximum(window[2:], (camera.width - 1, camera.height - 1)) + 1
     return bool((low <= last).all() and (high >= first).all())
+
+
+MARGIN = 4
+"""Pixels around what a box covers that interpolation may read."""
+
+
+def _rectangle(camera: Camera, box: Bounds) -> tuple[int, int, int, int]:
+    """Columns and rows, ends excluded, of the pixels that a box may be seen in, one at least."""
+    width, height = camera.width, camera.height
+    if camera.to_camera(corners(box))[:, 2].min() <= 0:
+        return 0, 0, width, height
+    at, most = camera.project(corners(box)), np.array([width, height]) - 1
+    low = (np.floor(at.min(0)) - MARGIN).clip(0, most).astype(int)
+    high = (np.ceil(at.max(0)) + MARGIN).clip(0, most).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1
+
+
+def _part(values: NDArray[np.float32], x0: int, y0: int, x1: int, y1: int) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values[y0:y1, x0:x1])
 
 
 def _distance(camera: Camera, inside: NDArray[np.float32], bounds: Bounds) -> float:

@@ -4,10 +4,11 @@ use crate::checks::{check, finite, room, rows, shaped, within};
 use crate::convert::{array, map_of, raster, rasters, run, slice, unfit};
 use mvcore::carve::{CarveParams, Silhouette};
 use mvcore::consistency::{ConsistencyParams, OtherView};
-use mvcore::fuse::{FusionParams, FusionView};
+use mvcore::fuse::{FusionParams, FusionView, Hint};
 use mvcore::grid::{BlockMap, Grid, SIDE, Tile};
 use mvcore::isosurface::Surface;
 use mvcore::photo_carve::{Photo, PhotoParams};
+use mvcore::raster::Cut;
 use numpy::{
     PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4, PyUntypedArrayMethods,
 };
@@ -61,7 +62,7 @@ pub fn distance_transform<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, unseen = None, truncation, free_weight, min_weight, solid_weight, smoothing, measured_smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
+#[pyo3(signature = (origin, voxel, shape, depths, weights, silhouettes, windows, projections, *, tile = None, cuts = None, hints = None, truncation, free_weight, min_weight, solid_weight, smoothing, measured_smoothing, hull_tolerance, complete = false, hollow = false, max_memory))]
 pub fn fuse<'py>(
     py: Python<'py>,
     origin: [f64; 3],
@@ -73,7 +74,8 @@ pub fn fuse<'py>(
     windows: Vec<[f64; 4]>,
     projections: PyReadonlyArray3<'py, f64>,
     tile: Option<[[usize; 3]; 2]>,
-    unseen: Option<PyReadonlyArray3<'py, bool>>,
+    cuts: Option<Vec<[usize; 4]>>,
+    hints: Option<PyReadonlyArray3<'py, i8>>,
     truncation: f64,
     free_weight: f32,
     min_weight: f32,
@@ -103,16 +105,24 @@ pub fn fuse<'py>(
     if weights.len() != n || windows.len() != n || silhouettes.as_ref().is_some_and(|s| s.len() != n) {
         return Err(unfit(py, "weights, silhouettes, windows", &format!("{n} of each, as many as depths"), "others"));
     }
-    let views: Vec<FusionView> = (0..n)
-        .map(|v| FusionView {
-            depth: depths[v],
-            weight: weights[v],
-            silhouette: silhouettes.as_ref().map(|s| s[v]),
+    let whole = |v: usize| [0, 0, depths[v].width, depths[v].height];
+    let cuts = cuts.unwrap_or_else(|| (0..n).map(whole).collect());
+    check(py, cuts.len() == n, "cuts", &format!("{n}, as many as depths"), cuts.len())?;
+    let cut = |raster, v: usize| {
+        let [left, top, width, height] = cuts[v];
+        Cut::new(raster, [left, top], [width, height], "cuts")
+    };
+    let view = |v: usize| {
+        Ok(FusionView {
+            depth: cut(depths[v], v)?,
+            weight: cut(weights[v], v)?,
+            silhouette: silhouettes.as_ref().map(|s| cut(s[v], v)).transpose()?,
             window: windows[v],
             projection: p[v],
             focal: (p[v][0].powi(2) + p[v][1].powi(2) + p[v][2].powi(2)).sqrt().max(1e-9),
         })
-        .collect();
+    };
+    let views = run(py, || (0..n).map(view).collect::<mvcore::Result<Vec<FusionView>>>())?;
     let params = FusionParams {
         truncation,
         free_weight,
@@ -125,11 +135,12 @@ pub fn fuse<'py>(
         hollow,
         max_memory,
     };
-    let unseen = unseen.as_ref().map_or(Ok(&[][..]), |flags| slice(flags, "unseen"))?;
+    let hints = hints.as_ref().map_or(Ok(&[][..]), |codes| slice(codes, "hints"))?;
+    let hints: Vec<Hint> = hints.iter().map(|&code| Hint::of(code)).collect();
     let volume = run(py, || {
         let grid = Grid::new(origin, voxel, shape)?;
         let tile = tile.map_or(Tile::whole(&grid), |[low, high]| Tile { low, high });
-        mvcore::fuse::fuse_tile(grid, tile, &views, &params, unseen)
+        mvcore::fuse::fuse_tile(grid, tile, &views, &params, &hints)
     })?;
     let count = volume.map.coords.len();
     Ok((

@@ -16,7 +16,7 @@ use crate::grid::{BLOCK, BlockMap, Grid, SIDE, Tile};
 use crate::hull::{SoftSilhouette, cut_block, deep_inside, mark_hull, restrict_to_hull};
 use crate::interrupt::Interrupt;
 use crate::memory::zeroed;
-use crate::raster::Raster;
+use crate::raster::Cut;
 use crate::smooth::{Beyond, Bits, Measured, smooth};
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -26,11 +26,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 #[derive(Debug, Clone, Copy)]
 pub struct FusionView<'a> {
     /// z-depth, 0 means none.
-    pub depth: Raster<'a, f32>,
+    pub depth: Cut<'a, f32>,
     /// Weight of each pixel's depth.
-    pub weight: Raster<'a, f32>,
+    pub weight: Cut<'a, f32>,
     /// Signed distance to the silhouette in pixels, positive outside it.
-    pub silhouette: Option<Raster<'a, f32>>,
+    pub silhouette: Option<Cut<'a, f32>>,
     /// What the camera saw, in pixels of the rasters: x0, y0, x1, y1. Larger than these where they are cut from a picture that shows
     /// only background around them.
     pub window: [f64; 4],
@@ -89,14 +89,14 @@ pub fn fuse(grid: Grid, views: &[FusionView], params: &FusionParams) -> Result<V
     fuse_tile(grid, Tile::whole(&grid), views, params, &[])
 }
 
-/// The same for the blocks of a tile; those on its sides lack what smoothing takes from beyond them. Where `params.hollow` holds, blocks
-/// in which no view has a surface are left out if `unseen` says so, one flag a block of the tile or none at all.
+/// The same for the blocks of a tile; those on its sides lack what smoothing takes from beyond them. Where `params.hollow` holds, `hints`
+/// say what a coarser field knows of each block, one a block of the tile or none at all.
 pub fn fuse_tile(
     grid: Grid,
     tile: Tile,
     views: &[FusionView],
     params: &FusionParams,
-    unseen: &[bool],
+    hints: &[Hint],
 ) -> Result<Volume> {
     let dims = grid.blocks();
     let fits = (0..3).all(|a| tile.low[a] < tile.high[a] && tile.high[a] <= dims[a]);
@@ -104,16 +104,13 @@ pub fn fuse_tile(
     require(!views.is_empty(), "views", "at least one view", "none")?;
     require(params.truncation > 0.0, "truncation", "a positive distance", params.truncation)?;
     for view in views {
-        let same = view.weight.width == view.depth.width && view.weight.height == view.depth.height;
-        require(
-            same,
-            "weight",
-            "the size of the depth map",
-            format!("{} x {}", view.weight.height, view.weight.width),
-        )?;
+        let (depth, weight) = (view.depth.part, view.weight.part);
+        let same =
+            weight.width == depth.width && weight.height == depth.height && view.weight.corner == view.depth.corner;
+        require(same, "weight", "the size of the depth map", format!("{} x {}", weight.height, weight.width))?;
     }
     let count = tile.count();
-    require(unseen.is_empty() || unseen.len() == count, "unseen", format!("{count} flags or none"), unseen.len())?;
+    require(hints.is_empty() || hints.len() == count, "hints", format!("{count} or none"), hints.len())?;
     // A slot and three flags a block.
     let table = count.saturating_mul(7);
     if table > params.max_memory {
@@ -138,8 +135,8 @@ pub fn fuse_tile(
     let mut flags: Vec<bool> = flags.into_iter().map(AtomicBool::into_inner).collect();
     let mut held = vec![1i8; count];
     if hull == Hull::Cuts && params.hollow {
-        let contents = contents(&grid, &tile, views, &tiles, &silhouettes, params, &flags);
-        let left_out = |n: usize| unseen.get(n) == Some(&true) && contents[n] != Content::Measured;
+        let contents = contents(&grid, &tile, views, &tiles, &silhouettes, params, &flags, hints);
+        let left_out = |n: usize| hints.get(n) == Some(&Hint::Unseen) && contents[n] != Content::Measured;
         let holds = |n: usize| match contents[n] {
             Content::Solid => -1,
             _ if flags[n] && left_out(n) => 0,
@@ -200,6 +197,32 @@ enum Hull {
     Completes,
 }
 
+/// What a coarser field knows of a block: it decides where no view has a surface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Hint {
+    /// Nothing: its voxels must be asked.
+    Ask,
+    /// Free throughout.
+    Free,
+    /// Solid throughout.
+    Solid,
+    /// There is a surface, and no camera sees it.
+    Unseen,
+}
+
+impl Hint {
+    /// From 0, 1, -1 or 2, in the order of the variants; [`Hint::Ask`] from any other.
+    #[must_use]
+    pub fn of(code: i8) -> Self {
+        match code {
+            1 => Self::Free,
+            -1 => Self::Solid,
+            2 => Self::Unseen,
+            _ => Self::Ask,
+        }
+    }
+}
+
 /// What all of a block's voxels hold.
 #[derive(Clone, Copy, PartialEq)]
 enum Content {
@@ -224,6 +247,7 @@ fn contents(
     silhouettes: &[SoftSilhouette],
     params: &FusionParams,
     flags: &[bool],
+    hints: &[Hint],
 ) -> Vec<Content> {
     let interrupt = Interrupt::current();
     let content = |(n, &flag): (usize, &bool)| {
@@ -233,7 +257,7 @@ fn contents(
         let at = tile.block(n).map(|v| v as u32);
         let (mut least, mut most) = (0.0f32, 0.0f32);
         for (view, tiles) in views.iter().zip(tiles) {
-            match Stepper::new(grid, at, &view.projection).says(tiles, params.truncation as f32) {
+            match Stepper::new(grid, at, &view.projection).says_exactly(view, tiles, params.truncation as f32) {
                 Says::Nothing => {}
                 Says::Free(weights) => {
                     least += params.free_weight * weights[0];
@@ -242,14 +266,16 @@ fn contents(
                 Says::Surface => return Content::Measured,
             }
         }
+        let deep = || deep_inside(grid, at, silhouettes, params.hull_tolerance, params.truncation);
         // Sums in another order differ in their last digits.
-        if most == 0.0 || most < params.solid_weight * 0.999 {
-            let deep = deep_inside(grid, at, silhouettes, params.hull_tolerance, params.truncation);
-            if deep { Content::Solid } else { Content::Mixed }
-        } else if least > params.solid_weight * 1.001 {
-            Content::Free
-        } else {
-            Content::Mixed
+        let (solid, free) = (most == 0.0 || most < params.solid_weight * 0.999, least > params.solid_weight * 1.001);
+        match hints.get(n) {
+            // A slit between the coarse field's samples may close, a part thinner than that stays.
+            Some(Hint::Solid) => Content::Solid,
+            Some(Hint::Free) if deep() => Content::Free,
+            _ if solid && deep() => Content::Solid,
+            _ if free && !solid => Content::Free,
+            _ => Content::Mixed,
         }
     };
     let contents = flags.par_iter().enumerate().map(content).collect();
@@ -277,12 +303,14 @@ fn mark_surface(grid: &Grid, tile: &Tile, view: &FusionView, truncation: f64, fl
     let block = grid.voxel * SIDE as f64;
     let rays = Rays::of(&view.projection);
     let interrupt = Interrupt::current();
-    (0..view.depth.height).into_par_iter().for_each(|y| {
+    let Cut { part, corner: [left, top], .. } = view.depth;
+    (0..part.height).into_par_iter().for_each(|row| {
         interrupt.poll();
-        for (x, &z) in view.depth.row(y).iter().enumerate() {
+        for (column, &z) in part.row(row).iter().enumerate() {
             if z <= 0.0 {
                 continue;
             }
+            let (x, y) = (left + column, top + row);
             let direction = rays.direction(x as f64, y as f64);
             let stride = ((block / 3.0 * view.focal / f64::from(z)) as usize).max(1);
             if x % stride != 0 || y % stride != 0 {
@@ -380,6 +408,32 @@ impl Stepper {
         let whole = low[0] >= 0.0 && low[1] >= 0.0 && high[0] <= width - 1.0 && high[1] <= height - 1.0;
         Says::Free([if whole { seen.weight[0] } else { 0.0 }, seen.weight[1]])
     }
+
+    /// The same from the pixels under the block where their tiles do not tell.
+    fn says_exactly(&self, view: &FusionView, tiles: &Tiles, truncation: f32) -> Says {
+        let rough = self.says(tiles, truncation);
+        let [low, high] = self.extent();
+        if !matches!(rough, Says::Surface) || low[2] <= 0.0 {
+            return rough;
+        }
+        let range = |a: usize, size: usize| {
+            let pixel = |p: f32| (p.max(0.0) as usize).min(size - 1);
+            pixel(low[a] - 1.0)..=pixel(high[a] + 1.5)
+        };
+        let mut weights = [f32::INFINITY, 0.0f32];
+        for y in range(1, view.depth.height) {
+            for x in range(0, view.depth.width) {
+                let (depth, weight) = (view.depth.at(x, y), view.weight.at(x, y));
+                let free = depth > high[2] + 1.01 * truncation;
+                if !free && depth >= low[2] - truncation {
+                    return Says::Surface;
+                }
+                let weight = if free { weight } else { 0.0 };
+                weights = [weights[0].min(weight), weights[1].max(weight)];
+            }
+        }
+        if weights[1] > 0.0 { Says::Free([0.0, weights[1]]) } else { Says::Nothing }
+    }
 }
 
 /// What a view says of a block.
@@ -432,12 +486,12 @@ impl Tiles {
         let (width, height) = (view.depth.width, view.depth.height);
         let across = width.div_ceil(TILE);
         let mut extremes = vec![Extremes::NONE; across * height.div_ceil(TILE)];
-        for y in 0..height {
-            let strips = view.depth.row(y).chunks(TILE).zip(view.weight.row(y).chunks(TILE));
-            for (x, (depth, weight)) in strips.enumerate() {
-                let of_strip = depth.iter().zip(weight).map(|(&d, &w)| Extremes::of(d, w));
-                let tile = &mut extremes[y / TILE * across + x];
-                *tile = of_strip.fold(*tile, Extremes::and);
+        let Cut { part, corner: [left, top], .. } = view.depth;
+        for row in 0..part.height {
+            let above = (top + row) / TILE * across;
+            for (column, (&depth, &weight)) in part.row(row).iter().zip(view.weight.part.row(row)).enumerate() {
+                let tile = &mut extremes[above + (left + column) / TILE];
+                *tile = tile.and(Extremes::of(depth, weight));
             }
         }
         Self { width, height, across, extremes }
@@ -546,14 +600,14 @@ fn sample(view: &FusionView, u: f32, v: f32, z: f32, inverse_truncation: f32) ->
         return (0.0, 0.0);
     }
     let (x, y) = ((u + 0.5) as usize, (v + 0.5) as usize);
-    let (nearest, weight) = (view.depth.data[y * w + x], view.weight.data[y * w + x]);
+    let (nearest, weight) = (view.depth.at(x, y), view.weight.at(x, y));
     if nearest <= 0.0 || (nearest - z) * inverse_truncation < -1.5 {
         return (nearest, if nearest > 0.0 { weight } else { 0.0 });
     }
     let (x0, y0) = (u.max(0.0) as usize, v.max(0.0) as usize);
     let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
-    let d = &view.depth.data;
-    let (p, q, r, s) = (d[y0 * w + x0], d[y0 * w + x1], d[y1 * w + x0], d[y1 * w + x1]);
+    let d = &view.depth;
+    let (p, q, r, s) = (d.at(x0, y0), d.at(x1, y0), d.at(x0, y1), d.at(x1, y1));
     let low = p.min(q).min(r).min(s);
     let high = p.max(q).max(r).max(s);
     if low <= 0.0 || (high - low) * inverse_truncation > 1.0 {
@@ -567,6 +621,7 @@ fn sample(view: &FusionView, u: f32, v: f32, z: f32, inverse_truncation: f32) ->
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::raster::Raster;
 
     /// A camera at (0, 0, -4) looking along +z, focal length 60, 64x64; a plane at z = 0 (depth 4).
     fn projection() -> [f64; 12] {
@@ -587,7 +642,7 @@ mod tests {
     };
 
     fn view<'a>(depth: &'a [f32], weight: &'a [f32], silhouette: Option<&'a [f32]>) -> FusionView<'a> {
-        let raster = |d| Raster::new(d, 64, 64, "raster").unwrap();
+        let raster = |d| Raster::new(d, 64, 64, "raster").unwrap().into();
         FusionView {
             depth: raster(depth),
             weight: raster(weight),

@@ -10,7 +10,7 @@
 
 use crate::grid::{Grid, SIDE, Tile};
 use crate::interrupt::Interrupt;
-use crate::raster::Raster;
+use crate::raster::Cut;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 #[derive(Debug, Clone, Copy)]
 pub struct SoftSilhouette<'a> {
     /// Signed distance to its border in pixels, positive outside.
-    pub distance: Raster<'a, f32>,
+    pub distance: Cut<'a, f32>,
     /// What the camera saw, in pixels of the raster: x0, y0, x1, y1.
     pub window: [f64; 4],
     /// P = K [R | t], row-major 3x4.
@@ -236,14 +236,14 @@ fn distance(view: &SoftSilhouette, p: [f64; 3]) -> Option<f32> {
 }
 
 /// A silhouette's distance in pixels; beyond the raster it is at least as far as the way to it.
-fn pixels(silhouette: &Raster<f32>, u: f64, v: f64) -> f32 {
+fn pixels(silhouette: &Cut<f32>, u: f64, v: f64) -> f32 {
     let inside = (u.clamp(0.0, silhouette.width as f64 - 1.0), v.clamp(0.0, silhouette.height as f64 - 1.0));
     let beyond = (u - inside.0).hypot(v - inside.1) as f32;
     let (u, v) = inside;
     let (x, y) = (u as usize, v as usize);
     let (x1, y1) = ((x + 1).min(silhouette.width - 1), (y + 1).min(silhouette.height - 1));
     let (a, b) = ((u - x as f64) as f32, (v - y as f64) as f32);
-    let at = |x: usize, y: usize| silhouette.data[y * silhouette.width + x];
+    let at = |x: usize, y: usize| silhouette.at(x, y);
     (1.0 - b) * ((1.0 - a) * at(x, y) + a * at(x1, y)) + b * ((1.0 - a) * at(x, y1) + a * at(x1, y1)) + beyond
 }
 
@@ -257,6 +257,7 @@ fn project(view: &SoftSilhouette, p: [f64; 3]) -> [f64; 3] {
 mod tests {
     use super::*;
     use crate::grid::BLOCK;
+    use crate::raster::Raster;
     use crate::testing::camera;
     use proptest::prelude::*;
 
@@ -276,7 +277,7 @@ mod tests {
             let raster = |d| Raster::new(d, w, h, "raster").unwrap();
             let border = if cropped { 20.0 } else { 0.0 };
             let views: Vec<SoftSilhouette> = rasters.iter().enumerate().map(|(n, d)| SoftSilhouette {
-                distance: raster(d),
+                distance: raster(d).into(),
                 window: [-border, -border, 47.0 + border, 39.0 + border],
                 projection: camera(n as f64 * 0.7 + seed as f64, w, h), focal: 60.0,
             }).collect();
