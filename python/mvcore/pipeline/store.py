@@ -150,8 +150,7 @@ class Store:
                     return None
                 time.sleep(0.01)  # `clean` looks at it, and puts it back if it is used
             except container.Damaged as damage:
-                LOGGER.warning("%s: this stored result is damaged, %s; it is removed and computed again", path, damage)
-                _discard(path, status)
+                self.discard(key, str(damage), status)
                 return None
             else:
                 _touch(path, status)
@@ -179,6 +178,13 @@ class Store:
         if path.is_dir():
             _discard(path, path.lstat())
         atomically(path, write, durable=False)  # a file that a power failure cut off does not have its digests
+
+    def discard(self, key: str, why: str, status: os.stat_result | None = None) -> None:
+        """Remove a damaged entry with a warning; ``status`` is its file's, where another one may have taken its place since."""
+        path = self.path(key)
+        LOGGER.warning("%s: this stored result is damaged, %s; it is removed and computed again", path, why)
+        with suppress(FileNotFoundError):
+            _discard(path, status or path.lstat())
 
     def drop(self, key: str) -> None:
         """Remove an entry, unless other runs use the folder: they may need it, and `clean` can have it later."""
