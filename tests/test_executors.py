@@ -6,8 +6,9 @@ import signal
 import subprocess
 import threading
 import time
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
+from threading import get_ident
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mvcore import InvalidInputError, ReconstructionError, _core
 from mvcore.errors import Interrupted
 from mvcore.pipeline import cluster
 from mvcore.pipeline.cluster import Cluster
-from mvcore.pipeline.executors import ATTEMPTS, open_pool
+from mvcore.pipeline.executors import ATTEMPTS, Interruption, open_pool
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
@@ -155,6 +156,48 @@ def test_an_error_ends_the_kernels_of_the_other_threads():
     assert _core.encode_png(image)
     with open_pool() as pool:
         assert pool.start(_core.encode_png, image)() == _core.encode_png(image)
+
+
+def python_alone(ended):
+    """No kernel, and nothing that looks for a flag."""
+    STARTED.set()
+    try:
+        while True:
+            sorted(range(1000))
+    finally:
+        ended.append(get_ident())
+
+
+@pytest.mark.parametrize("jobs", [0, 2], ids=["local threads", "the caller's executor"])
+def test_an_error_ends_python_code_of_the_other_threads(jobs):
+    STARTED.clear()
+    ended, waits = [], []
+
+    def run(pool):
+        waits.append(pool.start(python_alone, ended))
+        assert STARTED.wait(60)
+        raise ZeroDivisionError
+
+    with ThreadPoolExecutor(2) as executor:
+        with pytest.raises(ZeroDivisionError), open_pool(executor if jobs else None) as pool:
+            run(pool)
+        with pytest.raises(Interrupted):
+            waits[0]()
+        # The executor is the caller's, and whole.
+        assert [executor.submit(pow, n, 2).result() for n in range(50)] == [n * n for n in range(50)]
+    assert len(ended) == 1
+
+
+def test_an_interruption_ends_nothing_but_its_own_work():
+    done, ours = [], Interruption()
+    ours.run(done.append, 1)
+    ours.set()
+    ours.set()
+    with pytest.raises(Interrupted):
+        ours.run(done.append, 2)
+    Interruption().run(done.append, 3)
+    assert done == [1, 3]
+    assert _core.encode_png(np.zeros((8, 8, 3), np.uint8))
 
 
 # Clusters

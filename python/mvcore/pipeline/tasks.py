@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from .. import _core
 from ..errors import ReconstructionError
 from ..types import LOGGER, Track
 from .build import build
 from .cache import Cache, Missing, cache_of, forget, warnings_of
-from .executors import Pool
+from .executors import Interruption, Pool
 from .store import digest
 
 T = TypeVar("T")
@@ -191,8 +190,8 @@ class Runner:
 
     def __init__(self, place: Place, pool: Pool | None, threads: int) -> None:
         self.place, self.cache, self.pool = place, place.cache(), pool
-        self._interrupt = _core.Interrupt()
-        self._dispatch = ThreadPoolExecutor(threads, thread_name_prefix="mvcore-task", initializer=self._interrupt.enter)
+        self._interruption = Interruption()
+        self._dispatch = ThreadPoolExecutor(threads, thread_name_prefix="mvcore-task")
         self._futures: dict[str, Future[None]] = {}
         self._known: dict[str, tuple[Task[Any], Ledger]] = {}
         self._lock = threading.RLock()
@@ -211,9 +210,9 @@ class Runner:
         forget(self.place.folder)
 
     def stop(self) -> None:
-        """Give the run up: kernels of this process end within a fraction of a second, and nothing else begins."""
+        """Give the run up: tasks of this process end within a fraction of a second, and nothing else begins."""
         self._stopped = True
-        self._interrupt.set()
+        self._interruption.set()
         if self.pool is not None:
             self.pool.stop()
 
@@ -264,7 +263,7 @@ class Runner:
             arguments = tuple(_frozen(a) for a in wanted.arguments)
             call = (self.place, wanted.key, wanted.function, arguments)
             for _ in range(ATTEMPTS):
-                wall, cpu, missing = _work(*call) if self.pool is None else self.pool.start(_work, *call)()
+                wall, cpu, missing = self._interruption.run(_work, *call) if self.pool is None else self.pool.start(_work, *call)()
                 with self._lock:
                     self._known[wanted.key][1].add(wanted.stage, wall, cpu)
                 if missing is None:
