@@ -296,6 +296,7 @@ def test_ctrl_c_ends_a_command_whatever_it_is_in(kind, tmp_path):
     try:
         assert process.stdout.readline() == "start\n"
         assert len(list(tmp_path.iterdir())) == 1
+        time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     finally:

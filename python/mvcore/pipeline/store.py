@@ -189,7 +189,9 @@ class Store:
     def drop(self, key: str) -> None:
         """Remove an entry, unless other runs use the folder: they may need it, and `clean` can have it later."""
         if len(leases.live(self.folder / LEASES)) <= 1:
-            self.path(key).unlink(missing_ok=True)
+            path = self.path(key)
+            with suppress(FileNotFoundError):
+                _discard(path, path.lstat())
 
     def lease(self) -> AbstractContextManager[None]:
         """For the length of a run: what it uses is not removed by `clean`, in whatever process that runs."""
