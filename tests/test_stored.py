@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -239,3 +240,22 @@ def test_runs_go_on_from_damaged_results(scene, expected, finished, tmp_path, ca
         named = {Path(r.args[0]).stem for r in caplog.records if "is damaged" in r.getMessage()}
         assert named <= hit
         assert share < 1 or len(named) > 0.3 * len(hit)
+
+
+# ---- warnings
+
+
+def test_a_command_shows_each_warning_once(scene, tmp_path):
+    folder = tmp_path / "scene"
+    shutil.copytree(scene, folder)
+    cv2.imwrite(str(folder / "masks" / "003.png"), np.zeros((60, 80), np.uint8))
+    (tmp_path / "s.toml").write_text("texture.least_patch = 8\ndepth.planes = 32\nvolume.footprints = 2.5\n")
+    command = [sys.executable, "-m", "mvcore.cli.main", "reconstruct", str(folder), "-o", str(tmp_path / "a.glb")]
+    command += ["--masks", str(folder / "masks"), "--config", str(tmp_path / "s.toml"), "--workdir", str(tmp_path / "work")]
+    for _ in range(2):  # the second time all results are there
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        said = [text for text in done.stderr.splitlines() if text.startswith("warning: ")]
+        assert any("masks: 1 of 8 masks are empty (3)" in text for text in said)
+        assert any("too few sure matches" in text for text in said)  # of a stage
+        parts = [text.removeprefix("warning: ").removeprefix("masks: ") for text in said]
+        assert len(parts) == len(set(parts))
