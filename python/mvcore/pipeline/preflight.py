@@ -139,7 +139,7 @@ def preflight(
     check_places(outputs, [*folders, *([workdir] if workdir is not None else [])], notes)
     check_device(settings, notes)
     check_installation(notes)
-    outlook = _outlook(cameras, settings, moments) if len(cameras) >= 2 else None
+    outlook = _outlook(cameras, settings, moments, max_memory) if len(cameras) >= 2 else None
     if outlook is not None:
         try:
             memory_settings(settings, max_memory, outlook.width * outlook.height)
@@ -243,7 +243,7 @@ def _settings(config: Config | Mapping[str, Any] | None, notes: Findings) -> Con
         return Config()
 
 
-def _outlook(cameras: Sequence[Camera], config: Config, moments: int) -> Outlook:
+def _outlook(cameras: Sequence[Camera], config: Config, moments: int, max_memory: int | None) -> Outlook:
     limit = config.depth.max_image_size
     scales = [min(1.0, limit / max(c.width, c.height)) for c in cameras]
     sizes = [(round(c.width * s), round(c.height * s)) for c, s in zip(cameras, scales, strict=True)]
@@ -253,7 +253,8 @@ def _outlook(cameras: Sequence[Camera], config: Config, moments: int) -> Outlook
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     seconds = VIEW_SECONDS * len(used) + PIXEL_SECONDS[config.matcher] * float(sum(used))
     results = min(CACHE, int(VIEW_BYTES * pixels.sum()))
-    memory = BASE_BYTES + results + local_workers() * int(TASK_BYTES * pixels.max() + TASK_LEAST)
+    work = results + local_workers() * int(TASK_BYTES * pixels.max() + TASK_LEAST)
+    memory = BASE_BYTES + (work if max_memory is None else min(work, max_memory))
     width, height = sizes[int(pixels.argmax())]
     return Outlook(len(cameras), moments, width, height, sources, cores, round(seconds * moments / cores / 60, 2), memory)
 
