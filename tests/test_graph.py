@@ -163,7 +163,8 @@ def test_no_stage_reads_a_report():
 
 @pytest.fixture(scope="module")
 def scene():
-    cameras = [replace(c, name=f"cam{n:02d}") for n, c in enumerate(rig(8, (96, 72)))]
+    """Eight views of a target, near enough to each other for stereo."""
+    cameras = [replace(c, name=f"cam{n:02d}") for n, c in enumerate(rig(12, (96, 72))[:8])]
     frames, masks = zip(*(render_target(c, POSE) for c in cameras))
     return cameras, list(frames), list(masks)
 

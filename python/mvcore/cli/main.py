@@ -10,12 +10,14 @@ import threading
 import time
 
 from . import clean, reconstruct, tools, train, video
-from .app import INTERRUPTED, app
+from .app import INTERRUPTED, app, say_interrupted
 
 __all__ = ["app", "clean", "main", "reconstruct", "tools", "train", "video"]
 
 GRACE = 1.5
 """Seconds after Ctrl-C for a command to end by itself."""
+SHOW_CURSOR = b"\x1b[?25h"
+"""Progress bars hide it."""
 
 
 def main() -> None:
@@ -36,6 +38,9 @@ def _wait_and_end(near: socket.socket, _far: socket.socket) -> None:
     while signal.SIGINT not in near.recv(64):
         pass
     time.sleep(GRACE)
+    say_interrupted()
+    if sys.stderr.isatty():
+        os.write(sys.stderr.fileno(), SHOW_CURSOR)
     session = sys.modules.get("mvcore.pipeline.session")
     for folder in list(session.TEMPORARY) if session is not None else ():
         session.remove_temporary(folder)
