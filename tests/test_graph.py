@@ -346,7 +346,17 @@ def test_warnings_of_other_processes_are_logged_here(tmp_path, caplog):
         Runner(Place(tmp_path, 0, True), pool, 2) as runner,
     ):
         runner.start(task(doubtful, 1), Ledger()).result()
-    assert [r.getMessage() for r in caplog.records] == ["the images are dark", "view 1 is left out"]
+        assert caplog.messages == ["the images are dark", "view 1 is left out"]
+        # An array of an input that is damaged is found where it is read.
+        caplog.clear()
+        part = task(np.ones, 3000)
+        runner.start(part, Ledger()).result()
+        path = runner.cache.store.path(part.key)
+        path.write_bytes(path.read_bytes()[:-1] + b"x")
+        assert runner.value(task(np.sum, part), Ledger()) == 3000.0
+        assert caplog.messages == [
+            f"{path}: this stored result is damaged, an array does not have its digest; it is removed and computed again"
+        ]
 
 
 def test_results_of_another_build_are_not_taken(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from pathlib import Path
@@ -12,11 +13,15 @@ from .values import Arrays, pack, unpack
 
 
 class Missing(LookupError):
-    """A result that was there is gone or damaged; whoever knows how it was made makes it again."""
+    """A result that was there is gone or damaged; whoever knows how it was made makes it again.
 
-    def __init__(self, key: str) -> None:
-        super().__init__(key)
-        self.key = key
+    damage : what was logged of it. process : the number of the process that logged it.
+    """
+
+    def __init__(self, key: str, damage: str = "", process: int | None = None) -> None:
+        process = os.getpid() if process is None else process
+        super().__init__(key, damage, process)
+        self.key, self.damage, self.process = key, damage, process
 
 
 class Cache:
@@ -68,12 +73,12 @@ class Cache:
                 return self._values[key][0]
         entry = self.store.load(key)
         if entry is None:
-            raise Missing(key)
+            raise Missing(key, self.store.damages.pop(key, ""))
         try:
             value = unpack(entry.arrays, entry.meta["value"])
         except (ValueError, KeyError) as error:
             self.store.discard(key, str(error))
-            raise Missing(key) from None
+            raise Missing(key, self.store.damages.pop(key, "")) from None
         self._keep(key, value, sum(a.nbytes for a in entry.arrays.values()))
         return value
 

@@ -105,7 +105,7 @@ class Store:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder).absolute()
+        self.folder, self.damages = Path(folder).absolute(), dict[str, str]()
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def path(self, key: str) -> Path:
@@ -182,7 +182,8 @@ class Store:
     def discard(self, key: str, why: str, status: os.stat_result | None = None) -> None:
         """Remove a damaged entry with a warning; ``status`` is its file's, where another one may have taken its place since."""
         path = self.path(key)
-        LOGGER.warning("%s: this stored result is damaged, %s; it is removed and computed again", path, why)
+        self.damages[key] = f"{path}: this stored result is damaged, {why}; it is removed and computed again"
+        LOGGER.warning("%s", self.damages[key])
         with suppress(FileNotFoundError):
             _discard(path, status or path.lstat())
 

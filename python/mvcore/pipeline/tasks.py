@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
@@ -142,8 +143,8 @@ class Place:
         return cache_of(self.folder, self.budget, self.through)
 
 
-def _work(place: Place, key: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[float, float, str | None]:
-    """Runs a task where its worker is; wall and CPU seconds, and the key of an input that has vanished."""
+def _work(place: Place, key: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[float, float, Missing | None]:
+    """Runs a task where its worker is; wall and CPU seconds, and an input that has vanished."""
     if place.build != build():
         raise ReconstructionError(f"worker {socket.gethostname()}: expected the same mvcore, NumPy and OpenCV as the caller's, got others")
     cache, wall, me = place.cache(), time.perf_counter(), object()
@@ -153,7 +154,7 @@ def _work(place: Place, key: str, function: Callable[..., Any], arguments: tuple
         if key not in cache:
             cache.put(key, function(*(_thawed(cache, a) for a in arguments)))
     except Missing as error:
-        missing = error.key
+        missing = error.with_traceback(None)  # which would keep the inputs
     finally:
         cpu = _METER.stop(me)
     return time.perf_counter() - wall, cpu, missing
@@ -270,6 +271,8 @@ class Runner:
                     self._say(self.cache.warnings(wanted.key) or ())
                     future.set_result(None)
                     return
+                if missing.damage and missing.process != os.getpid():
+                    self._say([missing.damage])
                 self._complete(wanted)
             raise ReconstructionError(f"{self.place.folder}: results vanish while they are needed")
         except BaseException as error:
