@@ -1,4 +1,4 @@
-"""Stored work that can be trusted: whole runs on a cluster that loses workers, side by side in one workdir, and on damaged results."""
+"""Stored work that can be trusted: runs on a cluster that loses workers, side by side, on damaged results."""
 
 import contextlib
 import os
@@ -22,7 +22,7 @@ from mvcore.pipeline.store import Store
 from mvcore.pipeline.values import pack
 
 FLIPS = int(os.environ.get("MVCORE_FLIPS", "400"))
-"""Random bits turned over in the results of a finished run; a hundredth of them are damaged runs that go on."""
+"""Bits turned over in the results of a finished run; there are a hundredth as many damaged runs."""
 SETTINGS = {"texture": {"least_patch": 8}, "depth": {"planes": 32}, "volume": {"footprints": 2.5}}
 OTHERS = SETTINGS | {"depth": {"planes": 48}, "texture": {"seam": 2.0}}
 
@@ -159,7 +159,7 @@ def test_runs_side_by_side_in_one_workdir(scene, expected, tmp_path, settings):
 
 @pytest.fixture(scope="module")
 def finished(scene, expected, tmp_path_factory):
-    """The workdir of a finished run, with all results that the run had, the intermediate ones as well."""
+    """The workdir of a finished run, with all results that the run had, intermediate ones as well."""
     folder = tmp_path_factory.mktemp("finished")
     with Store(folder / "work").lease():  # what another run may need is not dropped
         assert photographs(scene, folder / "a.glb", workdir=folder / "work") == expected

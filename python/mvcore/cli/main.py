@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def _end_soon_after_ctrl_c() -> None:
-    """Has Ctrl-C end the process, whatever library its threads are in: files are written whole, so it can end anywhere."""
+    """Has Ctrl-C end the process, whatever its threads are in: files are written whole, so it can end anywhere."""
     near, far = socket.socketpair()
     far.setblocking(False)
     signal.set_wakeup_fd(far.fileno(), warn_on_full_buffer=False)

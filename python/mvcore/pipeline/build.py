@@ -20,7 +20,7 @@ KINDS = (".py", ".csv", ".safetensors")
 
 @lru_cache(maxsize=1)
 def build() -> str:
-    """A digest of the package's sources, weights and kernels, and of the versions of what computes beside them."""
+    """Digest of the package's sources, weights and kernels, and of the versions of NumPy and OpenCV."""
     return digest(
         version("mvcore"), np.__version__, cv2.__version__, contents(Path(__file__).parents[1]), file_digest(Path(_core.__file__))
     )

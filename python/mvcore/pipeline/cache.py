@@ -41,7 +41,10 @@ class Cache:
         self._lock = threading.RLock()
 
     def __contains__(self, key: str) -> bool:
-        """Whether it is there for all who use the folder: where values are written at once, one that has vanished from there is not."""
+        """Whether it is there for all who use the folder.
+
+        Where values are written at once, one that has vanished from the folder is not, though it be in memory.
+        """
         with self._lock:
             return (key in self._values and not self.through) or key in self.store
 

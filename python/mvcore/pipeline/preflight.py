@@ -42,7 +42,7 @@ VIEW_SECONDS = 1.0
 PIXEL_SECONDS = {"sgm": 25.0, "dcnn": 50.0}
 """CPU seconds a megapixel of a view, by matcher. Both measured on the bundled sample; good to a factor of two."""
 VIEW_BYTES = 60
-"""Bytes a pixel and view of results that are kept in memory where there is room: images, depth and confidence of the passes."""
+"""Bytes a pixel and view of results that are kept in memory where there is room."""
 BASE_BYTES = 250 << 20
 """Bytes of a process with its libraries before any image."""
 

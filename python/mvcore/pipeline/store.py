@@ -180,7 +180,10 @@ class Store:
         atomically(path, write, durable=False)  # a file that a power failure cut off does not have its digests
 
     def discard(self, key: str, why: str, status: os.stat_result | None = None) -> None:
-        """Remove a damaged entry with a warning; ``status`` is its file's, where another one may have taken its place since."""
+        """Remove a damaged entry with a warning.
+
+        ``status`` is that of its file, where another one may have taken its place since.
+        """
         path = self.path(key)
         self.damages[key] = f"{path}: this stored result is damaged, {why}; it is removed and computed again"
         LOGGER.warning("%s", self.damages[key])

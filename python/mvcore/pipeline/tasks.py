@@ -179,8 +179,8 @@ class Ledger:
 class Runner:
     """Runs tasks and what they need, each once, as soon as its inputs are there.
 
-    A result that vanishes or is damaged is made again from what it was made of. What results warn of is logged when they are there, each
-    warning once a run. Use as a context manager.
+    A result that vanishes or is damaged is made again from what it was made of. What results warn of is
+    logged when they are there, each warning once a run. Use as a context manager.
 
     Parameters
     ----------
