@@ -1,4 +1,8 @@
 import json
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -134,3 +138,46 @@ def write_scene(folder: Path, cameras, images) -> Path:
         views.append(view | {"K": c.K.tolist(), "R": c.R.tolist(), "t": c.t.tolist()})
     (folder / "cameras.json").write_text(json.dumps({"views": views}))
     return folder
+
+
+# ---- clusters
+
+ALLOWED = "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES"
+
+
+class Network:
+    """A scheduler and workers, each a process of this machine."""
+
+    def __init__(self, folder, *options):
+        self.folder, self.options, self.processes = folder, options, []
+        self.environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), ALLOWED: "1"}
+        where = folder / "scheduler.json"
+        self.scheduler = self._start("dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--scheduler-file", where)
+        for _ in range(600):
+            if where.exists() and where.stat().st_size:
+                break
+            assert self.scheduler.poll() is None
+            time.sleep(0.1)
+        self.address = json.loads(where.read_text())["address"]
+
+    def _start(self, module, *arguments):
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *map(str, arguments), *self.options, "--no-dashboard"]
+        process = subprocess.Popen(command, env=self.environment, cwd=self.folder, stderr=subprocess.DEVNULL)
+        self.processes.append(process)
+        return process
+
+    def work(self, count):
+        return [self._start("dask_worker", "--nthreads", "1", "--no-nanny", self.address) for _ in range(count)]
+
+    def end(self):
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def network(tmp_path):
+    pytest.importorskip("distributed")
+    made = Network(tmp_path)
+    yield made
+    made.end()

@@ -4,19 +4,20 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
+from threading import get_ident
 
 import numpy as np
 import pytest
+from conftest import Network
 from mvcore import InvalidInputError, ReconstructionError, _core
 from mvcore.errors import Interrupted
 from mvcore.pipeline import cluster
 from mvcore.pipeline.cluster import Cluster
-from mvcore.pipeline.executors import ATTEMPTS, open_pool
+from mvcore.pipeline.executors import ATTEMPTS, Interruption, open_pool
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
@@ -157,49 +158,49 @@ def test_an_error_ends_the_kernels_of_the_other_threads():
         assert pool.start(_core.encode_png, image)() == _core.encode_png(image)
 
 
+def python_alone(ended):
+    """No kernel, and nothing that looks for a flag."""
+    STARTED.set()
+    try:
+        while True:
+            sorted(range(1000))
+    finally:
+        ended.append(get_ident())
+
+
+@pytest.mark.parametrize("jobs", [0, 2], ids=["local threads", "the caller's executor"])
+def test_an_error_ends_python_code_of_the_other_threads(jobs):
+    STARTED.clear()
+    ended, waits = [], []
+
+    def run(pool):
+        waits.append(pool.start(python_alone, ended))
+        assert STARTED.wait(60)
+        raise ZeroDivisionError
+
+    with ThreadPoolExecutor(2) as executor:
+        with pytest.raises(ZeroDivisionError), open_pool(executor if jobs else None) as pool:
+            run(pool)
+        with pytest.raises(Interrupted):
+            waits[0]()
+        # The executor is the caller's, and whole.
+        assert [executor.submit(pow, n, 2).result() for n in range(50)] == [n * n for n in range(50)]
+    assert len(ended) == 1
+
+
+def test_an_interruption_ends_nothing_but_its_own_work():
+    done, ours = [], Interruption()
+    ours.run(done.append, 1)
+    ours.set()
+    ours.set()
+    with pytest.raises(Interrupted):
+        ours.run(done.append, 2)
+    Interruption().run(done.append, 3)
+    assert done == [1, 3]
+    assert _core.encode_png(np.zeros((8, 8, 3), np.uint8))
+
+
 # Clusters
-
-ALLOWED = "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES"
-
-
-class Network:
-    """A scheduler and workers, each a process of this machine."""
-
-    def __init__(self, folder, *options):
-        self.folder, self.options, self.processes = folder, options, []
-        self.environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), ALLOWED: "1"}
-        where = folder / "scheduler.json"
-        self.scheduler = self._start("dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--scheduler-file", where)
-        for _ in range(600):
-            if where.exists() and where.stat().st_size:
-                break
-            assert self.scheduler.poll() is None
-            time.sleep(0.1)
-        import json
-
-        self.address = json.loads(where.read_text())["address"]
-
-    def _start(self, module, *arguments):
-        command = [sys.executable, "-m", f"distributed.cli.{module}", *map(str, arguments), *self.options, "--no-dashboard"]
-        process = subprocess.Popen(command, env=self.environment, cwd=self.folder, stderr=subprocess.DEVNULL)
-        self.processes.append(process)
-        return process
-
-    def work(self, count):
-        return [self._start("dask_worker", "--nthreads", "1", "--no-nanny", self.address) for _ in range(count)]
-
-    def end(self):
-        for process in self.processes:
-            process.kill()
-            process.wait()
-
-
-@pytest.fixture
-def network(tmp_path):
-    pytest.importorskip("distributed")
-    made = Network(tmp_path)
-    yield made
-    made.end()
 
 
 @posix

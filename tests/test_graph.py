@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
+from multiprocessing import get_context
 from pathlib import Path
 
 import mvcore
@@ -18,11 +20,14 @@ import pytest
 from conftest import render_target, rig, turned, write_scene
 from hypothesis import given
 from hypothesis import strategies as st
+from mvcore import ReconstructionError
 from mvcore.geometry.local_frame import LocalFrame
 from mvcore.io import load_video
+from mvcore.pipeline.build import build, contents
 from mvcore.pipeline.cache import Cache
+from mvcore.pipeline.executors import open_pool
 from mvcore.pipeline.stages import Findings
-from mvcore.pipeline.tasks import Ledger, Place, Runner, task
+from mvcore.pipeline.tasks import ATTEMPTS, Ledger, Place, Runner, task
 from mvcore.pipeline.values import pack, unpack
 from mvcore.types import DepthMap
 
@@ -158,7 +163,8 @@ def test_no_stage_reads_a_report():
 
 @pytest.fixture(scope="module")
 def scene():
-    cameras = [replace(c, name=f"cam{n:02d}") for n, c in enumerate(rig(8, (96, 72)))]
+    """Eight views of a target, near enough to each other for stereo."""
+    cameras = [replace(c, name=f"cam{n:02d}") for n, c in enumerate(rig(12, (96, 72))[:8])]
     frames, masks = zip(*(render_target(c, POSE) for c in cameras))
     return cameras, list(frames), list(masks)
 
@@ -311,3 +317,89 @@ def test_a_pose_of_the_local_frame_is_one_of_the_world(angle, origin, mirrored):
 
 def test_findings_are_plain_values():
     assert pack(Findings({"a": 1.5}, ["b"]))[0] == {}
+
+
+# ---- warnings, and the build of the package
+
+
+def doubtful(n: int) -> Findings:
+    return Findings({}, ["the images are dark", f"view {n} is left out"])
+
+
+def test_warnings_are_logged_when_a_task_is_done_and_once_a_run(tmp_path, caplog):
+    said = ["the images are dark", "view 1 is left out", "view 2 is left out"]
+    for _ in range(2):  # the second time from the store
+        caplog.clear()
+        with Runner(Place(tmp_path, 0, True), None, 1) as runner:
+            runner.start(task(doubtful, 1), Ledger()).result()
+            assert [r.getMessage() for r in caplog.records] == said[:2]
+            runner.value(task(doubtful, 2), Ledger())
+            runner.value(task(doubtful, 1), Ledger())
+        assert [r.getMessage() for r in caplog.records] == said
+        assert {r.name for r in caplog.records} == {"mvcore"}
+
+
+def test_warnings_of_other_processes_are_logged_here(tmp_path, caplog):
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor,
+        open_pool(executor) as pool,
+        Runner(Place(tmp_path, 0, True), pool, 2) as runner,
+    ):
+        runner.start(task(doubtful, 1), Ledger()).result()
+        assert caplog.messages == ["the images are dark", "view 1 is left out"]
+        # An array of an input that is damaged is found where it is read.
+        caplog.clear()
+        part = task(np.ones, 3000)
+        runner.start(part, Ledger()).result()
+        path = runner.cache.store.path(part.key)
+        path.write_bytes(path.read_bytes()[:-1] + b"x")
+        assert runner.value(task(np.sum, part), Ledger()) == 3000.0
+        assert caplog.messages == [
+            f"{path}: this stored result is damaged, an array does not have its digest; it is removed and computed again"
+        ]
+
+
+def test_results_of_another_build_are_not_taken(tmp_path, monkeypatch):
+    before = task(source, "a", 1).key
+    monkeypatch.setattr("mvcore.pipeline.tasks.build", lambda: "another")
+    assert task(source, "a", 1).key != before
+    with (
+        Runner(Place(tmp_path, 0, True, "that of the caller"), None, 1) as runner,
+        pytest.raises(ReconstructionError, match="the same mvcore"),
+    ):
+        runner.value(task(source, "a", 1), Ledger())
+
+
+def test_a_build_is_told_by_what_results_depend_on(tmp_path):
+    for name in ("pipeline/stages.py", "network/a.safetensors", "cli/app.py", "network/training/train.py", "py.typed"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("1")
+    before = contents(tmp_path)
+    assert sorted(before) == ["network/a.safetensors", "pipeline/stages.py"]
+    (tmp_path / "pipeline" / "stages.py").write_text("2")
+    assert contents(tmp_path)["pipeline/stages.py"] != before["pipeline/stages.py"]
+    assert len(build()) == 40
+    assert build() == build()
+
+
+def test_many_damaged_inputs_of_damaged_inputs_are_made_again(tmp_path, caplog):
+    """More of them than attempts, each found when it is read alone."""
+    COUNTS.clear()
+    parts = [task(source, f"{n}", n) for n in range(2 * ATTEMPTS)]
+    middle = [task(total, [p, q]) for p, q in pairwise(parts)]
+    wanted = task(summed, middle)
+    with Runner(Place(tmp_path, 0, True), None, 2) as runner:
+        right = runner.value(wanted, Ledger())
+    paths = [Cache(tmp_path, 0, True).store.path(t.key) for t in (*parts, *middle, wanted)]
+    for path in paths:
+        data = bytearray(path.read_bytes())
+        data[-2 if path.stat().st_size > 1000 else 90] ^= 1
+        path.write_bytes(data)
+    with Runner(Place(tmp_path, 0, True), None, 2) as runner:
+        assert runner.value(wanted, Ledger()) == right
+    assert all(COUNTS[f"{n}"] == 2 for n in range(2 * ATTEMPTS))
+    assert all(str(path) in caplog.text for path in paths)
+
+
+def summed(parts) -> int:
+    return sum(parts[k] for k in range(len(parts)))

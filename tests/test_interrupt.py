@@ -258,3 +258,50 @@ def test_nothing_is_leaked_by_interrupted_kernels():
     thread.start()
     thread.join()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1e6  # kilobytes: eight of 200 would be more
+
+
+# ---- commands
+
+COMMAND = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background inherit that it is ignored
+from mvcore.cli import main
+from mvcore.cli.app import app
+{work}
+@app.command()
+def busy() -> None:
+    print("start", flush=True)
+    {call}
+sys.argv[1:] = ["busy"]
+main.main()
+"""
+LONG = {
+    "a library that hears of nothing": ("import hashlib", "hashlib.pbkdf2_hmac('sha256', b'', b'', 2_000_000_000)"),
+    "a thread that is waited for": (
+        "from concurrent.futures import ThreadPoolExecutor",
+        "ThreadPoolExecutor(1).submit(time.sleep, 600); time.sleep(600)",
+    ),
+    "Python alone": ("", "[None for _ in iter(int, 1)]"),
+}
+
+
+@posix
+@pytest.mark.parametrize("kind", LONG)
+def test_ctrl_c_ends_a_command_whatever_it_is_in(kind, tmp_path):
+    work, call = LONG[kind]
+    made = "from mvcore.pipeline.session import Workdir; place = Workdir(None)\n"
+    command = [sys.executable, "-c", COMMAND.format(work=made + work, call=call)]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert process.stdout.readline() == "start\n"
+        assert len(list(tmp_path.iterdir())) == 1
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 130, errors
+    assert errors == "interrupted\n"
+    assert list(tmp_path.iterdir()) == []

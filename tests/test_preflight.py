@@ -12,7 +12,7 @@ from mvcore import Config, InvalidInputError
 from mvcore.io import load_video
 from mvcore.pipeline import checks
 from mvcore.pipeline.checks import check_writable
-from mvcore.pipeline.preflight import candidate_sources, preflight, preflight_clips
+from mvcore.pipeline.preflight import BASE_BYTES, candidate_sources, preflight, preflight_clips
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +174,17 @@ def test_settings_memory_and_two_opencvs(monkeypatch):
     assert any("overwrite each other" in w for w in preflight(None, rig(4)).warnings)
     monkeypatch.setattr(checks.metadata, "distributions", lambda: map(Package, ["opencv-python-headless", "numpy"]))
     assert not any("overwrite" in w for w in preflight(None, rig(4)).warnings)
+
+
+def test_memory_is_that_of_the_task_graph():
+    """Of so many tasks at a time and results up to a bound, however many views there are."""
+    few, many = (preflight(None, rig(n, (4000, 3000))).outlook.memory for n in (100, 300))
+    assert few == many
+    assert 1 << 30 < many < 2 << 30
+    bounded = preflight(None, rig(12, (4000, 3000)), max_memory=800 << 20)
+    assert bounded.errors == []
+    assert bounded.outlook.memory <= BASE_BYTES + (800 << 20)
+    assert "expected at least" in preflight(None, rig(12, (4000, 3000)), max_memory=100 << 20).errors[0]
 
 
 def test_clips_are_checked_at_both_ends(tmp_path):

@@ -63,12 +63,17 @@ class DepthMap:
 
 @dataclass
 class Report:
-    """Figures of a run: nested plain values that JSON can hold, and the warnings."""
+    """Figures of a run: nested plain values that JSON can hold, and the warnings.
+
+    quiet : warnings are kept and not logged, where whoever has the report does that.
+    """
 
     values: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    quiet: bool = False
 
     def warn(self, message: str) -> None:
         """Keep a warning for the user, and log it at once."""
         self.warnings.append(message)
-        LOGGER.warning(message)
+        if not self.quiet:
+            LOGGER.warning(message)

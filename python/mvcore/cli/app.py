@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from threading import Event
 from typing import Annotated, Any
 
 import typer
@@ -85,6 +86,7 @@ class _Logged(logging.Handler):
 
 
 _current: ContextVar[Shown] = ContextVar("shown")
+_said = Event()
 
 
 def shown() -> Shown:
@@ -98,6 +100,7 @@ class Commands(TyperGroup):
     def main(self, args: Sequence[str] | None = None, *rest: Any, standalone_mode: bool = True, **extra: Any) -> Any:
         """Runs a command and exits."""
         words = _globals_first(list(sys.argv[1:] if args is None else args))
+        _said.clear()
         try:
             code = super().main(words, *rest, standalone_mode=False, **extra)
         except (KeyboardInterrupt, typer.Abort):
@@ -111,10 +114,17 @@ class Commands(TyperGroup):
         finally:
             _listen(None)
         if code == INTERRUPTED:  # typer makes this code of Ctrl-C, click an exception
-            print("interrupted", file=sys.stderr)
+            say_interrupted()
         if standalone_mode:
             sys.exit(code if isinstance(code, int) else DONE)
         return code
+
+
+def say_interrupted() -> None:
+    """Says that Ctrl-C ended the command, unless it is said."""
+    if not _said.is_set():
+        _said.set()
+        print("interrupted", file=sys.stderr, flush=True)
 
 
 def _listen(shown: Shown | None) -> None:

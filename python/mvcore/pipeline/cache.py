@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
 from .store import Store
-from .values import pack, unpack
+from .values import Arrays, pack, unpack
 
 
 class Missing(LookupError):
-    """A result that was there is gone or damaged; whoever knows how it was made makes it again."""
+    """A result that was there is gone or damaged; whoever knows how it was made makes it again.
 
-    def __init__(self, key: str) -> None:
-        super().__init__(key)
-        self.key = key
+    damage : what was logged of it. process : the number of the process that logged it.
+    """
+
+    def __init__(self, key: str, damage: str = "", process: int | None = None) -> None:
+        process = os.getpid() if process is None else process
+        super().__init__(key, damage, process)
+        self.key, self.damage, self.process = key, damage, process
 
 
 class Cache:
@@ -36,8 +41,26 @@ class Cache:
         self._lock = threading.RLock()
 
     def __contains__(self, key: str) -> bool:
+        """Whether it is there for all who use the folder.
+
+        Where values are written at once, one that has vanished from the folder is not, though it be in memory.
+        """
         with self._lock:
-            return key in self._values or key in self.store
+            return (key in self._values and not self.through) or key in self.store
+
+    def intact(self, key: str) -> bool:
+        """The same, and all of it can be read."""
+        with self._lock:
+            held = key in self._values and not self.through
+        return held or self.store.intact(key)
+
+    def warnings(self, key: str) -> list[str] | None:
+        """Of a value, without its arrays; None where it is not there."""
+        with self._lock:
+            if key in self._values:
+                return warnings_of(self._values[key][0])
+        entry = self.store.load(key, ())
+        return None if entry is None else [str(w) for w in entry.meta.get("warnings", [])]
 
     def get(self, key: str) -> Any:
         """A value.
@@ -53,21 +76,21 @@ class Cache:
                 return self._values[key][0]
         entry = self.store.load(key)
         if entry is None:
-            raise Missing(key)
+            raise Missing(key, self.store.damages.pop(key, ""))
         try:
             value = unpack(entry.arrays, entry.meta["value"])
-        except (ValueError, KeyError):
-            self.store.path(key).unlink(missing_ok=True)
-            raise Missing(key) from None
+        except (ValueError, KeyError) as error:
+            self.store.discard(key, str(error))
+            raise Missing(key, self.store.damages.pop(key, "")) from None
         self._keep(key, value, sum(a.nbytes for a in entry.arrays.values()))
         return value
 
     def put(self, key: str, value: Any) -> None:
         """Keep a value."""
-        arrays, tree = pack(value)
+        packed = pack(value)
         if self.through:
-            self.store.save(key, arrays, {"value": tree})
-        self._keep(key, value, sum(a.nbytes for a in arrays.values()))
+            self._save(key, value, packed)
+        self._keep(key, value, sum(a.nbytes for a in packed[0].values()))
 
     def drop(self, key: str) -> None:
         """Forget a value, on disk as well unless other runs are there."""
@@ -82,9 +105,17 @@ class Cache:
             while self._held > self.budget and self._values:
                 old, (left, bytes_) = self._values.popitem(last=False)
                 if old not in self.store:
-                    arrays, tree = pack(left)
-                    self.store.save(old, arrays, {"value": tree})
+                    self._save(old, left, pack(left))
                 self._held -= bytes_
+
+    def _save(self, key: str, value: Any, packed: tuple[Arrays, Any]) -> None:
+        arrays, tree = packed
+        self.store.save(key, arrays, {"value": tree, "warnings": warnings_of(value)})
+
+
+def warnings_of(value: Any) -> list[str]:
+    """What a result warns of: itself, or in its findings."""
+    return list(getattr(getattr(value, "findings", value), "warnings", ()))
 
 
 _CACHES: dict[Path, Cache] = {}

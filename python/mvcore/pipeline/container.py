@@ -140,7 +140,7 @@ def _header(file: Any) -> tuple[dict[str, Any], int]:
         header = json.loads(text)
     except (ValueError, RecursionError):
         raise Damaged("its header cannot be read") from None
-    if not isinstance(header, dict) or not {"key", "arrays", "meta"} <= header.keys():
+    if not isinstance(header, dict) or not {"key", "arrays", "meta"} <= header.keys() or not isinstance(header["meta"], dict):
         raise Damaged("its header cannot be read")
     return header, PREFIX.size + length
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from threading import Event, Lock
+from threading import Event, Lock, get_ident
 from typing import Any, Protocol
 
 from .. import _core
@@ -33,12 +34,58 @@ def local_workers() -> int:
     return max(2, min(4, (os.cpu_count() or 1) // 4))
 
 
+class Interruption:
+    """Ends what threads of this process do: kernels by their flag, the Python code between them by an exception."""
+
+    def __init__(self) -> None:
+        self._flag, self._set = _core.Interrupt(), False
+        self._inside: set[int] = set()
+        self._lock = Lock()
+
+    def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Does work in the calling thread.
+
+        Raises
+        ------
+        Interrupted
+            `set` was called before or meanwhile.
+        """
+        me = get_ident()
+        try:
+            with self._lock:
+                if self._set:
+                    raise Interrupted("the work was given up")
+                self._inside.add(me)
+            self._flag.enter()
+            return function(*arguments)
+        finally:
+            with self._lock:
+                self._inside.discard(me)
+                _raise_in(me, None)  # what has not arrived yet must not do so elsewhere
+            _core.Interrupt().enter()  # other users' work in this thread does not end
+
+    def set(self) -> None:
+        """Ends the work, now and later."""
+        with self._lock:
+            threads = [] if self._set else list(self._inside)
+            self._set = True
+            self._flag.set()
+            for thread in threads:
+                _raise_in(thread, Interrupted)
+
+
+def _raise_in(thread: int, error: type[Exception] | None) -> None:
+    """Has a thread raise an error as soon as it is in Python code; None takes it back."""
+    argument = None if error is None else ctypes.py_object(error)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), argument)
+
+
 class ExecutorPool:
     """On an executor. One of processes that breaks, as a worker died, is replaced by another like it."""
 
     def __init__(self, executor: Executor) -> None:
         self.executor = executor
-        self._interrupt = _core.Interrupt() if isinstance(executor, ThreadPoolExecutor) else None
+        self._interruption = Interruption() if isinstance(executor, ThreadPoolExecutor) else None
         self._lock = Lock()
         self._stopped = Event()
         self._replaced = False
@@ -70,10 +117,10 @@ class ExecutorPool:
         return result
 
     def stop(self) -> None:
-        """Gives the work up: waits end, and kernels that run in threads of this pool do."""
+        """Gives the work up: waits end, and what runs in threads of this pool does."""
         self._stopped.set()
-        if self._interrupt is not None:
-            self._interrupt.set()
+        if self._interruption is not None:
+            self._interruption.set()
 
     def close(self) -> None:
         """Shuts down what took the place of a broken executor."""
@@ -107,16 +154,7 @@ class ExecutorPool:
             return self.executor.submit(*self._call(function, arguments)), self.executor
 
     def _call(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-        return (function, *arguments) if self._interrupt is None else (_under, self._interrupt, function, *arguments)
-
-
-def _under(interrupt: _core.Interrupt, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Does work in a thread whose kernels end with the pool's flag."""
-    interrupt.enter()
-    try:
-        return function(*arguments)
-    finally:
-        _core.Interrupt().enter()  # other users' work in this thread does not
+        return (function, *arguments) if self._interruption is None else (self._interruption.run, function, *arguments)
 
 
 def _lost(error: Exception) -> bool:

@@ -34,15 +34,15 @@ from .checks import (
     check_masks,
     check_places,
 )
+from .executors import local_workers
+from .session import CACHE, TASK_BYTES, TASK_LEAST, memory_settings
 
 VIEW_SECONDS = 1.0
 """CPU seconds that a view takes whatever its size: the sweep runs on a small image."""
 PIXEL_SECONDS = {"sgm": 25.0, "dcnn": 50.0}
 """CPU seconds a megapixel of a view, by matcher. Both measured on the bundled sample; good to a factor of two."""
 VIEW_BYTES = 60
-"""Bytes a pixel and view that stay in memory through a run: the image, depth and confidence before and after the filter."""
-TASK_BYTES = 400
-"""Bytes a pixel of the view that is being worked on, for each of the views in work."""
+"""Bytes a pixel and view of results that are kept in memory where there is room."""
 BASE_BYTES = 250 << 20
 """Bytes of a process with its libraries before any image."""
 
@@ -53,7 +53,8 @@ class Outlook:
 
     views : cameras. frames : moments of a clip, 1 for photographs. width, height : pixels of the largest view as it is matched.
     sources : of each view, the others that see the scene's middle from a useful angle, nearest first, by the poses alone.
-    cores : processors. minutes : expected wall time. memory : expected bytes at the peak, beside the volume's ``volume.max_memory``.
+    cores : processors. minutes : expected wall time. memory : expected bytes at the peak, beside the volume's ``volume.max_memory``:
+    of the idle process, of the tasks at a time, and of the results that are kept in memory; the others lie on disk.
     """
 
     views: int
@@ -138,8 +139,12 @@ def preflight(
     check_places(outputs, [*folders, *([workdir] if workdir is not None else [])], notes)
     check_device(settings, notes)
     check_installation(notes)
-    outlook = _outlook(cameras, settings, moments) if len(cameras) >= 2 else None
+    outlook = _outlook(cameras, settings, moments, max_memory) if len(cameras) >= 2 else None
     if outlook is not None:
+        try:
+            memory_settings(settings, max_memory, outlook.width * outlook.height)
+        except InvalidInputError as error:
+            notes.error("max_memory", error)
         _check_memory(outlook, max_memory, notes)
     return Preflight(tuple(notes.items), outlook)
 
@@ -238,7 +243,7 @@ def _settings(config: Config | Mapping[str, Any] | None, notes: Findings) -> Con
         return Config()
 
 
-def _outlook(cameras: Sequence[Camera], config: Config, moments: int) -> Outlook:
+def _outlook(cameras: Sequence[Camera], config: Config, moments: int, max_memory: int | None) -> Outlook:
     limit = config.depth.max_image_size
     scales = [min(1.0, limit / max(c.width, c.height)) for c in cameras]
     sizes = [(round(c.width * s), round(c.height * s)) for c, s in zip(cameras, scales, strict=True)]
@@ -247,7 +252,9 @@ def _outlook(cameras: Sequence[Camera], config: Config, moments: int) -> Outlook
     used = [p / 1e6 for p, s in zip(pixels, sources, strict=True) if s]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     seconds = VIEW_SECONDS * len(used) + PIXEL_SECONDS[config.matcher] * float(sum(used))
-    memory = BASE_BYTES + int(VIEW_BYTES * pixels.sum() + TASK_BYTES * pixels.max())
+    results = min(CACHE, int(VIEW_BYTES * pixels.sum()))
+    work = results + local_workers() * int(TASK_BYTES * pixels.max() + TASK_LEAST)
+    memory = BASE_BYTES + (work if max_memory is None else min(work, max_memory))
     width, height = sizes[int(pixels.argmax())]
     return Outlook(len(cameras), moments, width, height, sources, cores, round(seconds * moments / cores / 60, 2), memory)
 

@@ -28,6 +28,10 @@ REMOTE_THREADS = 64
 """Tasks that are sent out at a time to an executor or a cluster."""
 
 
+TEMPORARY: set[Path] = set()
+"""Folders that are removed at the latest when the process ends."""
+
+
 class Workdir:
     """A folder of results; a temporary one is removed with its last user."""
 
@@ -35,7 +39,14 @@ class Workdir:
         self.temporary, self.kept = folder is None, set[str]()
         self.folder = Path(folder if folder is not None else tempfile.mkdtemp(prefix="mvcore-")).absolute()
         if self.temporary:
-            weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+            TEMPORARY.add(self.folder)
+            weakref.finalize(self, remove_temporary, self.folder)
+
+
+def remove_temporary(folder: Path) -> None:
+    """Removes a temporary folder with all that is in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    TEMPORARY.discard(folder)
 
 
 class StoredDepths(Sequence[DepthMap | None]):

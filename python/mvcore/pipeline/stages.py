@@ -39,7 +39,7 @@ Mask = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Findings:
-    """What a stage has to say: figures for the report, by name, and warnings."""
+    """What a stage has to say: figures for the report, by name, and warnings, which are logged when its task is done."""
 
     figures: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -96,7 +96,7 @@ def survey(found: Sequence[Features], cameras: Sequence[Camera], bounds: Bounds 
     ReconstructionError
         The calibration misses the images by more than ``config.fail_error`` pixels, and few points fit it.
     """
-    report, every = Report(), list(found)
+    report, every = Report(quiet=True), list(found)
     pairs = candidate_pairs(cameras, config.neighbours)
     misfit = calibration_error(cameras, every, pairs)
     # An error of a few pixels is worth a wider band; a larger one means that the matches or the calibration are wrong.
@@ -184,7 +184,7 @@ def locate(
     ``least`` and ``margin`` are those of `VideoConfig`.
     """
     every = list(_Masks(views)) if masks is None else list(masks)
-    findings = Findings(warnings=mask_warnings(every) if masks is None else [])
+    findings = Findings(warnings=[f"masks: {w}" for w in mask_warnings(every)] if masks is None else [])
     hull = bounded_hull(every, cameras, box, carving)
     parts, hulls = find_targets(hull, every, cameras, least)
     if not parts:
@@ -493,7 +493,7 @@ def draft(depths: Sequence[DepthMap | None], pixels: Sequence[Pixels], rig: Rig,
     wide = replace(volume, footprints=times * volume.footprints, voxel=volume.voxel and times * volume.voxel)
     # What no camera sees, no view's depth starts from.
     wanted = replace(settings, volume=wide, unseen_reach=settings.unseen_reach or 0.0)
-    surface = _isosurface(depths, pixels, rig, completion, wanted, Report())
+    surface = _isosurface(depths, pixels, rig, completion, wanted, Report(quiet=True))
     # Nobody sees it: it is neither closed nor smoothed nor decimated.
     plain = SurfaceConfig(min_component=settings.min_component, close_holes=0, decimation=0)
     return Draft(cleaned(surface, 0.0, plain, solid=rig.masked), completion, findings)
@@ -503,7 +503,7 @@ def complete(
     depths: Sequence[DepthMap | None], pixels: Sequence[Pixels], rig: Rig, settings: FieldSettings
 ) -> tuple[Standing | None, Findings]:
     """Silhouettes of an object that depth maps show little of, where there are no masks."""
-    report = Report()
+    report = Report(quiet=True)
     if rig.masked or not settings.standing.enabled:
         return None, Findings()
     found = find_standing(_Images(pixels), rig.cameras, depths, rig.box, settings.standing, settings.carve, report)
@@ -544,7 +544,7 @@ def extract(
     ReconstructionError
         Nothing lies inside the box.
     """
-    report = Report()
+    report = Report(quiet=True)
     completion, findings = (draft.completion, draft.findings) if draft else complete(depths, pixels, rig, settings)
     surface = _isosurface(depths, pixels, rig, completion, settings, report)
     if target is not None and len(surface.faces):

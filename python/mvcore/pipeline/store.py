@@ -105,7 +105,7 @@ class Store:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder).absolute()
+        self.folder, self.damages = Path(folder).absolute(), dict[str, str]()
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def path(self, key: str) -> Path:
@@ -150,8 +150,7 @@ class Store:
                     return None
                 time.sleep(0.01)  # `clean` looks at it, and puts it back if it is used
             except container.Damaged as damage:
-                LOGGER.warning("%s: this stored result is damaged, %s; it is removed and computed again", path, damage)
-                _discard(path, status)
+                self.discard(key, str(damage), status)
                 return None
             else:
                 _touch(path, status)
@@ -180,10 +179,23 @@ class Store:
             _discard(path, path.lstat())
         atomically(path, write, durable=False)  # a file that a power failure cut off does not have its digests
 
+    def discard(self, key: str, why: str, status: os.stat_result | None = None) -> None:
+        """Remove a damaged entry with a warning.
+
+        ``status`` is that of its file, where another one may have taken its place since.
+        """
+        path = self.path(key)
+        self.damages[key] = f"{path}: this stored result is damaged, {why}; it is removed and computed again"
+        LOGGER.warning("%s", self.damages[key])
+        with suppress(FileNotFoundError):
+            _discard(path, status or path.lstat())
+
     def drop(self, key: str) -> None:
         """Remove an entry, unless other runs use the folder: they may need it, and `clean` can have it later."""
         if len(leases.live(self.folder / LEASES)) <= 1:
-            self.path(key).unlink(missing_ok=True)
+            path = self.path(key)
+            with suppress(FileNotFoundError):
+                _discard(path, path.lstat())
 
     def lease(self) -> AbstractContextManager[None]:
         """For the length of a run: what it uses is not removed by `clean`, in whatever process that runs."""

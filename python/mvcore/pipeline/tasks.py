@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,17 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from .. import _core
 from ..errors import ReconstructionError
-from ..types import Track
-from .cache import Cache, Missing, cache_of, forget
-from .executors import Pool
+from ..types import LOGGER, Track
+from .build import build
+from .cache import Cache, Missing, cache_of, forget, warnings_of
+from .executors import Interruption, Pool
 from .store import digest
 
 T = TypeVar("T")
 
-VERSION = 11
-"""Of what stages compute: results of other versions are not taken for this one's."""
 ATTEMPTS = 8
 """Times that inputs of a task that vanish are made again before it is an error."""
 
@@ -50,9 +50,9 @@ class Task(Generic[T]):
 
 
 def task(function: Callable[..., T], *arguments: Any) -> Task[T]:
-    """A task, named by its function and the content of its arguments."""
+    """A task, named by its function, the content of its arguments and the build of the package."""
     named = [_content(a) for a in arguments]
-    return Task(function, arguments, digest("mvcore", VERSION, function.__module__, function.__qualname__, named))
+    return Task(function, arguments, digest("mvcore", build(), function.__module__, function.__qualname__, named))
 
 
 def _content(argument: Any) -> Any:
@@ -131,19 +131,22 @@ _METER = _Meter()
 
 @dataclass(frozen=True)
 class Place:
-    """Where results lie, as every worker sees it."""
+    """Where results lie, as every worker sees it, and the build of the package that they are of."""
 
     folder: Path
     budget: int
     through: bool
+    build: str = field(default_factory=build)
 
     def cache(self) -> Cache:
         """This process's cache there."""
         return cache_of(self.folder, self.budget, self.through)
 
 
-def _work(place: Place, key: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[float, float, str | None]:
-    """Runs a task where its worker is; wall and CPU seconds, and the key of an input that has vanished."""
+def _work(place: Place, key: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[float, float, Missing | None]:
+    """Runs a task where its worker is; wall and CPU seconds, and an input that has vanished."""
+    if place.build != build():
+        raise ReconstructionError(f"worker {socket.gethostname()}: expected the same mvcore, NumPy and OpenCV as the caller's, got others")
     cache, wall, me = place.cache(), time.perf_counter(), object()
     _METER.start(me)
     missing = None
@@ -151,7 +154,7 @@ def _work(place: Place, key: str, function: Callable[..., Any], arguments: tuple
         if key not in cache:
             cache.put(key, function(*(_thawed(cache, a) for a in arguments)))
     except Missing as error:
-        missing = error.key
+        missing = error.with_traceback(None)  # which would keep the inputs
     finally:
         cpu = _METER.stop(me)
     return time.perf_counter() - wall, cpu, missing
@@ -176,7 +179,8 @@ class Ledger:
 class Runner:
     """Runs tasks and what they need, each once, as soon as its inputs are there.
 
-    A result that vanishes or is damaged is made again from what it was made of. Use as a context manager.
+    A result that vanishes or is damaged is made again from what it was made of. What results warn of is
+    logged when they are there, each warning once a run. Use as a context manager.
 
     Parameters
     ----------
@@ -187,11 +191,13 @@ class Runner:
 
     def __init__(self, place: Place, pool: Pool | None, threads: int) -> None:
         self.place, self.cache, self.pool = place, place.cache(), pool
-        self._interrupt = _core.Interrupt()
-        self._dispatch = ThreadPoolExecutor(threads, thread_name_prefix="mvcore-task", initializer=self._interrupt.enter)
+        self._interruption = Interruption()
+        self._dispatch = ThreadPoolExecutor(threads, thread_name_prefix="mvcore-task")
         self._futures: dict[str, Future[None]] = {}
         self._known: dict[str, tuple[Task[Any], Ledger]] = {}
         self._lock = threading.RLock()
+        self._again_locks: dict[str, threading.Lock] = {}
+        self._said: set[str] = set()
         self._stopped = False
 
     def __enter__(self) -> Runner:
@@ -205,9 +211,9 @@ class Runner:
         forget(self.place.folder)
 
     def stop(self) -> None:
-        """Give the run up: kernels of this process end within a fraction of a second, and nothing else begins."""
+        """Give the run up: tasks of this process end within a fraction of a second, and nothing else begins."""
         self._stopped = True
-        self._interrupt.set()
+        self._interruption.set()
         if self.pool is not None:
             self.pool.stop()
 
@@ -219,7 +225,8 @@ class Runner:
             future: Future[None] = Future()
             self._futures[wanted.key] = future
             self._known[wanted.key] = wanted, ledger
-            if wanted.key in self.cache:
+            if wanted.key in self.cache and (warnings := self.cache.warnings(wanted.key)) is not None:
+                self._say(warnings)
                 ledger.reused += 1
                 future.set_result(None)
                 return future
@@ -257,27 +264,46 @@ class Runner:
             arguments = tuple(_frozen(a) for a in wanted.arguments)
             call = (self.place, wanted.key, wanted.function, arguments)
             for _ in range(ATTEMPTS):
-                wall, cpu, missing = _work(*call) if self.pool is None else self.pool.start(_work, *call)()
+                wall, cpu, missing = self._interruption.run(_work, *call) if self.pool is None else self.pool.start(_work, *call)()
                 with self._lock:
                     self._known[wanted.key][1].add(wanted.stage, wall, cpu)
                 if missing is None:
+                    self._say(self.cache.warnings(wanted.key) or ())
                     future.set_result(None)
                     return
-                self._again(missing)
+                if missing.damage and missing.process != os.getpid():
+                    self._say([missing.damage])
+                self._complete(wanted)
             raise ReconstructionError(f"{self.place.folder}: results vanish while they are needed")
         except BaseException as error:
             future.set_exception(error)
 
-    def _again(self, key: str) -> None:
-        """Makes a vanished result once more, in this thread."""
-        wanted, _ = self._known[key]
-        for one in wanted.inputs():
-            if one.key not in self.cache:
-                self._known.setdefault(one.key, (one, self._known[key][1]))
-                self._again(one.key)
-        again: Future[None] = Future()
-        self._attempt(wanted, again)
-        again.result()
+    def _complete(self, wanted: Task[Any]) -> None:
+        """Makes those inputs of a task once more, in this thread, that have vanished or are damaged."""
+        for one in {t.key: t for t in wanted.inputs()}.values():
+            if not self.cache.intact(one.key):
+                self._again(one, self._known[wanted.key][1])
+
+    def _again(self, wanted: Task[Any], ledger: Ledger) -> None:
+        """Makes a vanished result once more, in this thread; other threads that need it wait."""
+        with self._lock:
+            self._known.setdefault(wanted.key, (wanted, ledger))
+            lock = self._again_locks.setdefault(wanted.key, threading.Lock())
+        with lock:
+            if wanted.key in self.cache:
+                return
+            self._complete(wanted)
+            again: Future[None] = Future()
+            self._attempt(wanted, again)
+            again.result()
+
+    def _say(self, warnings: Iterable[str]) -> None:
+        """Logs what no task of this run has said before."""
+        with self._lock:
+            new = [w for w in dict.fromkeys(warnings) if w not in self._said]
+            self._said.update(new)
+        for message in new:
+            LOGGER.warning("%s", message)
 
     def value(self, wanted: Task[T], ledger: Ledger) -> T:
         """A task's result."""
@@ -288,10 +314,12 @@ class Runner:
         """The result of a task that is done; made again where it has vanished since."""
         for _ in range(ATTEMPTS):
             try:
-                return self.cache.get(wanted.key)  # type: ignore[no-any-return]
+                value = self.cache.get(wanted.key)
             except Missing:
-                self._known.setdefault(wanted.key, (wanted, Ledger()))
-                self._again(wanted.key)
+                self._again(wanted, Ledger())
+            else:
+                self._say(warnings_of(value))
+                return value  # type: ignore[no-any-return]
         raise ReconstructionError(f"{self.place.folder}: results vanish while they are needed")
 
     def needed(self, wanted: Iterable[Task[Any]]) -> set[str]:

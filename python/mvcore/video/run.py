@@ -42,7 +42,7 @@ from ..pipeline.sources import ClipFrame, clip_frames
 from ..pipeline.stages import Findings, Plan, Survey, Target
 from ..pipeline.tasks import Runner, Task, task
 from ..silhouettes.background_subtraction import Background
-from ..types import Bounds, Image, SparsePoints, Track
+from ..types import LOGGER, Bounds, Image, SparsePoints, Track
 from .tracking import Tracker
 
 T = TypeVar("T")
@@ -255,6 +255,7 @@ class ClipRun:
             target, silhouettes = located(whole, cameras, learnt.survey.box, job.bounds, learnt.backgrounds, config)
             where: Target = run.value(target)
             if not where.parts:
+                LOGGER.warning("frame %d: no target is seen", t)
                 return FrameDone(t, target, time.perf_counter() - started, run)
             views, box, points = cropped(inputs, whole, where, silhouettes, config), where.box, stages.no_points(len(cameras))
             run.all(views.pixels, "target")
