@@ -7,7 +7,6 @@ import pytest
 from conftest import rig
 from fuzz import seeds
 from mvcore.errors import FormatError
-from mvcore.io.formats.camera_folders import camera_image, plain_name
 from mvcore.io.scene import Scene
 
 
@@ -22,15 +21,20 @@ def picture(path):
     return path
 
 
-def test_where_a_cameras_image_lies(tmp_path):
-    for n, place in enumerate(("a.png", "images/a.png", "images/a/0.jpg", "a/0.jpg", "a/data/0.jpg")):
-        image = picture(tmp_path / str(n) / place)
-        assert camera_image(tmp_path / str(n), "a") == image
-    picture(tmp_path / "3" / "a" / "1.jpg")  # a clip
-    assert camera_image(tmp_path / "3", "a") is None
-    for name in ("", "..", "../a", "/etc/passwd", "a\0", "a\\b"):
-        assert not plain_name(name)
-        assert camera_image(tmp_path, name) is None
+@pytest.mark.parametrize("place", ["{}.png", "images/{}.png", "images/{}/0.jpg", "{}/0.jpg", "{}/data/0.jpg"])
+def test_where_a_cameras_image_lies(tmp_path, scene, place):
+    for n in range(3):
+        picture(tmp_path / f"{n}.png")
+    seeds._kalibr(tmp_path, scene)
+    for n in range(3):
+        (tmp_path / f"cam{n}.png").unlink()
+    images = [picture(tmp_path / place.format(f"cam{n}")) for n in range(3)]
+    assert list(mvcore.load(tmp_path).frames) == images
+    if "/0" in place:
+        picture(images[0].with_name("1.jpg"))
+        with pytest.raises(FormatError, match="several instants are a clip"):
+            mvcore.load(tmp_path)
+        assert len(mvcore.load(tmp_path, images=False)) == 3
 
 
 def test_easymocap_with_one_image_a_camera_and_names_without_quotes(tmp_path, scene):
@@ -50,9 +54,10 @@ def test_easymocap_with_one_image_a_camera_and_names_without_quotes(tmp_path, sc
     for a, b in zip(read.calib, scene.calib):
         np.testing.assert_allclose(a.project([[0.1, 0.2, 0.3]]), b.project([[0.1, 0.2, 0.3]]), atol=1e-9)
     text = (tmp_path / "intri.yml").read_text()
-    (tmp_path / "intri.yml").write_text(text.replace("- 00", "- ../00"))
-    with pytest.raises(FormatError, match=r"intri\.yml: expected a list 'names' of cameras"):
-        mvcore.load(tmp_path)
+    for name in ('""', '".."', '"../a"', "/etc/passwd", "a\\\\b"):
+        (tmp_path / "intri.yml").write_text(text.replace("- 00", f"- {name}"))
+        with pytest.raises(FormatError, match=r"intri\.yml: expected a list 'names' of cameras"):
+            mvcore.load(tmp_path)
     (tmp_path / "intri.yml").write_text(text.replace("W_01: 32", "W_01: 1e300"))
     with pytest.raises(FormatError, match=r"intri\.yml: W_01: expected a number of pixels"):
         mvcore.load(tmp_path)

@@ -9,7 +9,6 @@ import numpy as np
 
 from ...errors import FormatError
 from ..limits import MOST_SIDE
-from .camera_folders import camera_image
 from .filestorage import read_yaml
 from .records import Found, Record
 
@@ -23,8 +22,8 @@ LOOK = 4096
 def find(path: Path) -> Path | None:
     """A file whose name holds ``camchain``, or the only one in a folder; else one whose content is a chain of cameras."""
     if path.is_file():
-        return path if path.suffix in SUFFIXES and ("camchain" in path.name or _is_chain(path)) else None
-    files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES and f.is_file())
+        return path if path.suffix.lower() in SUFFIXES and ("camchain" in path.name or _is_chain(path)) else None
+    files = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
     named = [f for f in files if "camchain" in f.name]
     chains = named or [f for f in files if _is_chain(f)]
     return chains[0] if len(chains) == 1 else None
@@ -38,7 +37,7 @@ def _is_chain(path: Path) -> bool:
 
 
 def read(path: Path) -> Found:
-    """``cam0``, ``cam1`` ... in this order; one image of each may lie beside the file (`camera_folders.camera_image`)."""
+    """``cam0``, ``cam1`` ... in this order."""
     documents = read_yaml(path)
     data = documents[0] if len(documents) == 1 else None
     chain = {k: v for k, v in data.items() if k.startswith("cam")} if isinstance(data, dict) else {}
@@ -84,7 +83,6 @@ def _record(path: Path, name: str, camera: Any, pose: np.ndarray) -> Record:
         t=pose[:3, 3],
         width=int(width),
         height=int(height),
-        image=camera_image(path.parent, name),
         name=name,
         distortion=distortion if any(distortion) or MODELS[kind] else (),
         fisheye=MODELS[kind],

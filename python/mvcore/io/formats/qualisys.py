@@ -14,7 +14,6 @@ import numpy as np
 
 from ...errors import FormatError
 from ..limits import MOST_SIDE
-from .camera_folders import camera_image
 from .filestorage import read_xml
 from .records import Found, Record
 
@@ -75,7 +74,6 @@ def _record(path: Path, number: int, camera: ElementTree.Element) -> Record:
         t=-rotation @ position,
         width=round(width),
         height=round(height),
-        image=camera_image(path.parent, name),
         name=name,
         distortion=(distortion if distortion[4] else distortion[:4]) if any(distortion) else (),
     )
