@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mvcore import Camera, FormatError
 from mvcore.io.formats.colmap import COUNTS, MODELS, SUPPORTED
+from mvcore.io.formats.lens import TOLERANCE
 from mvcore.io.images import distorted_pixels, undistort
 
 COEFFICIENTS = {
@@ -99,6 +100,21 @@ def test_undistorted_images_are_what_a_pinhole_sees(fisheye, distortion, skew):
     assert np.abs(flat[inside] - (127 + 60 * np.sin(seen[inside] / 25))).max() < 2  # grey levels: rounding and interpolation
 
 
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_images_larger_than_opencv_remaps_are_undistorted_in_parts(monkeypatch, fisheye):
+    camera = Camera([[300, 0, 160], [0, 310, 120], [0, 0, 1]], np.eye(3), np.zeros(3), 320, 240, [0.03, -0.01, 0, 0], fisheye)
+    image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
+    whole = undistort(image, camera)
+    monkeypatch.setattr("mvcore.io.images.PART", 50)
+    monkeypatch.setattr("mvcore.io.images.MOST_SIDE", 230)
+    np.testing.assert_array_equal(undistort(image, camera), whole)
+    monkeypatch.undo()
+    wide = Camera([[3e4, 0, 16500], [0, 3e4, 20], [0, 0, 1]], np.eye(3), np.zeros(3), 33000, 40, [-0.1, 0, 0, 0])
+    steps = np.repeat(np.arange(33000)[None] // 200, 40, 0).astype(np.uint8)
+    seen = distorted_pixels(wide, [[32000, 20]])[0, 0]
+    assert undistort(steps, wide)[20, 32000] == pytest.approx(seen // 200, abs=1)
+
+
 def nerf(folder, common, **frame):
     (folder / "images").mkdir(exist_ok=True)
     frames = []
@@ -122,11 +138,25 @@ def test_nerf_lenses(tmp_path):
     assert not mvcore.load(nerf(tmp_path, {"is_fisheye": False})).calib[0].distorted
     plain = mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV", "k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5})).calib[0]
     assert plain.distortion.tolist() == [0.1, 0.2, 0.3, 0.4, 0.5]
-    with pytest.raises(FormatError, match=r"frames\[0\]: k4"):
-        mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV", "k4": 0.2}))
+    with pytest.raises(FormatError, match=r"frames\[0\]: k1 .. k4: no such perspective lens.*\(-2, 0, 0, 0.2\)"):
+        mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV", "k1": -2.0, "k4": 0.2}))
     for model in ("EQUIRECTANGULAR", "FISHEYE624"):
         with pytest.raises(FormatError, match=f"camera_model '{model}' is not supported"):
             mvcore.load(nerf(tmp_path, {}, camera_model=model))
+
+
+@pytest.mark.parametrize(("k", "sized", "tolerance"), [((-0.1, 0.02, 0.001, 0.2), True, TOLERANCE), ((0.05, 0.0, 0.0, -0.02), False, 1e-6)])
+def test_nerfstudios_fourth_radial_term(tmp_path, k, sized, tolerance):
+    """Its radial_and_tangential_undistort: d = 1 + r (k1 + r (k2 + r (k3 + r k4))) with r = x² + y²; p1 and p2 as OpenCV's."""
+    lens = dict(zip(("k1", "k2", "k3", "k4"), k)) | {"p1": 0.002, "p2": -0.001}
+    camera = mvcore.load(nerf(tmp_path, lens | ({} if sized else {"w": None, "h": None}))).calib[0]
+    x, y = np.random.default_rng(0).uniform([-0.5, -0.35], [0.5, 0.35], (200, 2)).T
+    r = x * x + y * y
+    d = 1 + r * (k[0] + r * (k[1] + r * (k[2] + r * k[3])))
+    u = d * x + 2 * 0.002 * x * y - 0.001 * (r + 2 * x * x)
+    v = d * y - 2 * 0.001 * x * y + 0.002 * (r + 2 * y * y)
+    pixels = distorted_pixels(camera, np.column_stack([60 * x + 31.5, 61 * y + 23.5]))
+    assert np.abs(pixels - np.column_stack([60 * u + 31.5, 61 * v + 23.5])).max() < tolerance
 
 
 def test_a_field_of_view_needs_the_images_size(tmp_path):

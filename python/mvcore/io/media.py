@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image as PillowImage
+from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..types import Image
+from .decode import read_header
 from .formats.records import IMAGE_SUFFIXES, image_size
-from .images import read_image
+from .images import read_image, read_mask
 from .pairing import natural_order
 from .streams import open_stream, video_frame
 
@@ -23,7 +24,6 @@ VIDEO_SUFFIXES = (
 """Compared without case."""
 PLATES = ("background", "clean", "plate", "empty")
 """Names, without their suffix, of an image without the target among a camera's frames."""
-EXIF_ORIENTATION = 0x0112
 EXIF_TURNS = {3: 2, 6: 3, 8: 1}
 """Quarter turns, counter-clockwise, that show an image of that EXIF orientation upright."""
 
@@ -48,11 +48,16 @@ class Clip:
     def frame(self, number: int) -> Image:
         """Frame ``number``, (h, w, 3) uint8 RGB."""
         if isinstance(self.source, Path):
-            image = video_frame(self.source, number)
-        elif isinstance(self.source, tuple):
-            image = read_image(self.source[number])
-        else:
-            image = self.source[number]
+            return self._upright(video_frame(self.source, number), number)
+        return self._upright(read_image(self.source[number]) if isinstance(self.source, tuple) else self.source[number], number)
+
+    def mask(self, number: int) -> NDArray[np.uint8]:
+        """Frame ``number`` of a clip of masks, (h, w) uint8 of 0 and 255: files as `read_mask` takes them, else where it is bright."""
+        if isinstance(self.source, tuple):
+            return self._upright(read_mask(self.source[number]), number)
+        return np.where(self.frame(number).max(2) > 127, 255, 0).astype(np.uint8)
+
+    def _upright(self, image: NDArray[np.uint8], number: int) -> NDArray[np.uint8]:
         if self.turn:
             image = np.ascontiguousarray(np.rot90(image, self.turn))
         if image.shape[:2] != (self.height, self.width):
@@ -80,11 +85,7 @@ def plate_in(folder: Path) -> Path | None:
 
 def image_turn(path: Path) -> int:
     """Quarter turns, counter-clockwise, that an image's EXIF block asks for; 0 without one."""
-    with PillowImage.open(path) as image:
-        try:
-            return EXIF_TURNS.get(image.getexif().get(EXIF_ORIENTATION, 1), 0)
-        except Exception:
-            return 0  # a broken EXIF block says nothing about the pixels
+    return EXIF_TURNS.get(read_header(path).orientation, 0)
 
 
 def media_size(folder: Path, name: str) -> tuple[int, int]:

@@ -120,8 +120,10 @@ def check_frames(frames: Sequence[Frame], cameras: Sequence[Camera], notes: Find
             notes.error(view_name(camera, n), error)
 
 
-def check_masks(masks: Sequence[Frame | None] | str | Path, frames: Sequence[Frame], cameras: Sequence[Camera], notes: Findings) -> None:
-    """One mask a frame, of its shape; empty and inverted ones."""
+def check_masks(
+    masks: Sequence[Frame | None] | str | Path, frames: Sequence[Frame], cameras: Sequence[Camera], notes: Findings, decode: bool = True
+) -> None:
+    """One mask a frame, of its shape; with ``decode`` empty and inverted ones."""
     try:
         each = find_masks(masks, frames) if isinstance(masks, str | Path) else list(masks)
         require(len(each) == len(cameras), "masks", f"{len(cameras)}, one a frame", len(each))
@@ -136,7 +138,8 @@ def check_masks(masks: Sequence[Frame | None] | str | Path, frames: Sequence[Fra
                 size, want = (header.width, header.height), (cameras[n].width, cameras[n].height)
                 fits = same_shape(size, want) or header.turned == want
                 require(fits, f"masks[{n}]", f"{want[0]} x {want[1]} pixels as its camera", f"{size[0]} x {size[1]}")
-            looked.append(None if each[n] is None else load_mask(each[n], cameras[n], n))
+            if decode:
+                looked.append(None if each[n] is None else load_mask(each[n], cameras[n], n))
         except (MvcoreError, OSError) as error:
             notes.error(view_name(cameras[n], n), error)
     for message in mask_warnings(looked):

@@ -1,11 +1,12 @@
 """NeRF, instant-ngp and nerfstudio ``transforms.json``: camera-to-world, OpenGL axes, corner origin.
 
 Values of a frame override common ones. ``camera_model`` names the projection (nerfstudio), or ``is_fisheye`` does
-(instant-ngp); without either, distortion is OpenCV's k1 k2 p1 p2 k3.
+(instant-ngp); without either, distortion is OpenCV's k1 k2 p1 p2 k3 with nerfstudio's k4, a factor of r⁸.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ...errors import FormatError
 from ..limits import read_json
+from .lens import brown, corner_radius, polynomial
 from .native import numbers, path_in, pixels
 from .records import Found, Record
 
@@ -84,7 +86,7 @@ def _focal(angle: float | None, side: int) -> float | None:
     return 0.5 * side / float(np.tan(0.5 * angle)) if angle is not None and 0 < angle < np.pi else None
 
 
-def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float], bool]:
+def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float] | Callable[[int, int], list[float]], bool]:
     """OpenCV's coefficients, and whether they are the fisheye model's."""
     model = str(frame.get("camera_model") or "").upper()
     if model and model not in (*PERSPECTIVE, *FISHEYE):
@@ -100,7 +102,16 @@ def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float], bool]:
         return [k1, k2, k3, k4], True
     if model == "FULL_OPENCV":
         return [k1, k2, p1, p2, k3, k4, k5, k6], False
-    if k4:
-        raise FormatError(f"{where}: k4: expected 0 for a perspective camera (OpenCV has three radial terms), got {k4:g}; is it a fisheye?")
-    values = [k1, k2, p1, p2, k3]
-    return (values if any(values) else []), False
+    if not k4:
+        return brown(k1, k2, p1, p2, k3), False
+    return lambda width, height: _four_terms(where, frame, width, height, [k1, k2, k3, k4], p1, p2), False
+
+
+def _four_terms(where: str, frame: dict[str, Any], width: int, height: int, radial: list[float], p1: float, p2: float) -> list[float]:
+    """nerfstudio's 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸ as OpenCV's rational model."""
+    matrix = np.array(_matrix(where, frame, width, height))
+    values = polynomial(radial, p1, p2, float(matrix[0, 0]), corner_radius(matrix, width, height))
+    if values is None:
+        text = ", ".join(f"{v:g}" for v in radial)
+        raise FormatError(f"{where}: k1 .. k4: no such perspective lens, its distortion turns back in the image ({text}); is it a fisheye?")
+    return values
