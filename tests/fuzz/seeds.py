@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -34,21 +35,7 @@ def scenes(folder: Path) -> dict[str, Path]:
     images = [np.full((24, 32, 3), 40 * n, np.uint8) for n in range(COUNT)]
     out = {"native": write_scene(folder / "native", cameras, images)}
     scene = mvcore.load(out["native"])
-    for build in (
-        _colmap_text,
-        _colmap_binary,
-        _mvsnet,
-        _nerf,
-        _idr,
-        _middlebury,
-        _strecha,
-        _qualisys,
-        _easymocap,
-        _kalibr,
-        _opencv,
-        _stereo,
-    ):
-        name = build.__name__.strip("_")
+    for name, build in BUILDERS.items():
         (folder / name / "images").mkdir(parents=True)
         for n, image in enumerate(images):
             cv2.imwrite(str(folder / name / f"{n}.png"), image)
@@ -58,8 +45,8 @@ def scenes(folder: Path) -> dict[str, Path]:
     return out | _scenes_of_tools(folder)
 
 
-def _scenes_of_tools(folder: Path) -> dict[str, Path]:
-    """Data sets of the tools that `other_tools` writes."""
+def _tools() -> dict[str, Callable[[Path], object]]:
+    """What writes a data set of each of the tools in `other_tools`."""
     poses = other_tools.views()
     writers = {name: lambda at, write=write: write(at, poses) for name, write in other_tools.WRITERS.items()}
     writers |= {f"ROS {model}": lambda at, model=model: other_tools.write_ros(at, model) for model in other_tools.ROS_LENSES}
@@ -68,8 +55,15 @@ def _scenes_of_tools(folder: Path) -> dict[str, Path]:
     names = (("M1", "D1", "M2", "D2"), ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"))
     for storages, keys in ((["intrinsics.yml", "extrinsics.yml"], names[0]), (["stereo.xml"], names[1]), (["stereo.json"], names[0])):
         writers[f"stereo {storages[0]}"] = lambda at, files=storages, keys=keys: _stereo_pair(at, poses, files, keys, motion)
+    return writers
+
+
+TOOLS = _tools()
+
+
+def _scenes_of_tools(folder: Path) -> dict[str, Path]:
     out = {}
-    for name, write in writers.items():
+    for name, write in TOOLS.items():
         (folder / name).mkdir()
         write(folder / name)
         out[name] = folder / name / "office0" if name == "Replica" else folder / name
@@ -262,3 +256,20 @@ def files(folder: Path) -> dict[str, Path]:
     index = {"format": "mvcore sequence", "version": 1, "warnings": ["v"], "instants": [instant], "rigid": rigid}
     out["index"].write_text(json.dumps(index))
     return out
+
+
+BUILDERS = {
+    "colmap_text": _colmap_text,
+    "colmap_binary": _colmap_binary,
+    "mvsnet": _mvsnet,
+    "nerf": _nerf,
+    "idr": _idr,
+    "middlebury": _middlebury,
+    "strecha": _strecha,
+    "qualisys": _qualisys,
+    "easymocap": _easymocap,
+    "kalibr": _kalibr,
+    "opencv": _opencv,
+    "stereo": _stereo,
+}
+"""The formats that came first, but for our own."""

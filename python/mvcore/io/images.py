@@ -119,7 +119,9 @@ def find_pictures(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     found = {}
     for name in names:
         inner = sorted((folder / name).iterdir()) if (folder / name).is_dir() else []
-        files = [f for f in [*sorted(folder.glob(f"{name}.*")), *inner] if f.suffix.lower() in IMAGE_SUFFIXES]
+        files = [
+            f for f in [*sorted(folder.glob(f"{name}.*")), *inner] if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")
+        ]
         if not files:
             raise FormatError(f"{folder}: no picture of camera {name}")
         found[name] = files[0]

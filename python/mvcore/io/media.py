@@ -68,19 +68,23 @@ class Clip:
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file's suffix is a video's."""
-    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+    """Whether a file's suffix is a video's; hidden files, which file managers leave, are none."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def frame_files(folder: Path) -> list[Path]:
     """A folder's images in natural order, without a clean plate."""
-    files = [f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.lower() not in PLATES]
+    files = [f for f in folder.iterdir() if _is_image(f) and f.stem.lower() not in PLATES]
     return sorted(files, key=natural_order)
 
 
 def plate_in(folder: Path) -> Path | None:
     """A folder's clean plate."""
-    return next((f for f in sorted(folder.iterdir()) if f.stem.lower() in PLATES and f.suffix.lower() in IMAGE_SUFFIXES), None)
+    return next((f for f in sorted(folder.iterdir()) if f.stem.lower() in PLATES and _is_image(f)), None)
 
 
 def image_turn(path: Path) -> int:

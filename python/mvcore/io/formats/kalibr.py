@@ -11,6 +11,7 @@ from ...errors import FormatError
 from ..limits import MOST_SIDE
 from .filestorage import read_yaml
 from .records import Found, Record
+from .values import files_in
 
 MODELS = {"radtan": False, "equidistant": True, "none": False}
 """Distortion models, and whether each is OpenCV's fisheye: ``equidistant`` is, whatever its coefficients."""
@@ -22,9 +23,9 @@ LOOK = 4096
 def find(path: Path) -> Path | None:
     """A file whose name holds ``camchain``, or the only one in a folder; else one whose content is a chain of cameras."""
     if path.is_file():
-        return path if path.suffix.lower() in SUFFIXES and ("camchain" in path.name or _is_chain(path)) else None
-    files = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
-    named = [f for f in files if "camchain" in f.name]
+        return path if path.suffix.lower() in SUFFIXES and ("camchain" in path.name.lower() or _is_chain(path)) else None
+    files = files_in(path, *SUFFIXES)
+    named = [f for f in files if "camchain" in f.name.lower()]
     chains = named or [f for f in files if _is_chain(f)]
     return chains[0] if len(chains) == 1 else None
 

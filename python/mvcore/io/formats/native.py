@@ -18,6 +18,7 @@ from ...errors import FormatError, InvalidInputError
 from ...geometry.projections import cameras_from_projections
 from ...types import Bounds
 from ..limits import read_json
+from .places import named
 from .records import Found, Record
 
 NAME = "cameras.json"
@@ -29,8 +30,8 @@ MOST_PIXELS = 1_000_000
 def find(path: Path) -> Path | None:
     """The file, if the path is one or holds one."""
     if path.is_dir():
-        return path / NAME if (path / NAME).is_file() else None
-    if path.suffix.lower() != ".json" or path.name.startswith("transforms"):
+        return named(path, NAME)
+    if path.suffix.lower() != ".json" or path.name.lower().startswith("transforms"):
         return None
     return path
 

@@ -16,6 +16,7 @@ from ...errors import FormatError
 from ..limits import read_json
 from .lens import brown, corner_radius, polynomial
 from .native import numbers, path_in, pixels
+from .places import named
 from .records import Found, Record
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -26,8 +27,8 @@ FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE
 def find(path: Path) -> Path | None:
     """The file, if the path is one or holds one."""
     if path.is_file():
-        return path if path.name.startswith("transforms") and path.suffix.lower() == ".json" else None
-    return next((path / n for n in NAMES if (path / n).is_file()), None)
+        return path if path.name.lower().startswith("transforms") and path.suffix.lower() == ".json" else None
+    return named(path, *NAMES)
 
 
 def read(path: Path) -> Found:

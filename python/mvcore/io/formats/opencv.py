@@ -7,6 +7,7 @@ Of a camera file: ``camera_matrix`` (K), ``distortion_coefficients`` (D), ``rvec
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ...errors import FormatError
 from ..limits import MOST_SIDE
 from .filestorage import read_filestorage
 from .records import Found, Record, image_in
+from .values import files_in, head
 
 SUFFIXES = (".yml", ".yaml", ".xml")
 KEYS = {
@@ -31,6 +33,10 @@ KEYS = {
     "height": ("image_height", "height"),
 }
 
+SNIFF = 1 << 16
+"""Bytes that are searched for the name of the camera matrix."""
+MATRIX = re.compile(rf"""^[ \t]*["<]?(?:{"|".join(KEYS["K"])})["> \t:]""", re.MULTILINE)
+
 
 def find(path: Path) -> Path | None:
     """A storage file, or a folder of some."""
@@ -40,13 +46,18 @@ def find(path: Path) -> Path | None:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES)
+    return files_in(folder, *SUFFIXES)
 
 
 def read(path: Path) -> Found:
     """The cameras of a file or a folder, by name."""
-    files = [path] if path.is_file() else _files(path)
-    return Found([_camera(f, read_filestorage(f)) for f in files], path)
+    if path.is_file():
+        return Found([_camera(path, read_filestorage(path))], path)
+    files = _files(path)
+    cameras = [f for f in files if MATRIX.search(head(f, SNIFF))] or files
+    others = [f.name for f in files if f not in cameras]
+    warnings = (f"{len(others)} files without a camera matrix left out: {', '.join(others[:5])}",) if others else ()
+    return Found([_camera(f, read_filestorage(f)) for f in cameras], path, warnings=warnings)
 
 
 def storage_value(path: Path, storage: dict[str, Any], names: Sequence[str]) -> Any:

@@ -16,6 +16,7 @@ from ...errors import FormatError
 from ..limits import MOST_SIDE
 from .filestorage import read_xml
 from .records import Found, Record
+from .values import files_in
 
 SUBPIXELS = 64.0
 MOST = 1e12
@@ -25,8 +26,8 @@ MOST = 1e12
 def find(path: Path) -> Path | None:
     """A ``.qca.txt`` file, or the only one in a folder or in its ``calibration`` folder."""
     if path.is_file():
-        return path if path.name.endswith(".qca.txt") else None
-    files = [f for folder in (path, path / "calibration") if folder.is_dir() for f in sorted(folder.glob("*.qca.txt"))]
+        return path if path.name.lower().endswith(".qca.txt") else None
+    files = [f for folder in (path, path / "calibration") for f in files_in(folder, ".txt") if f.name.lower().endswith(".qca.txt")]
     return files[0] if len(files) == 1 else None
 
 
