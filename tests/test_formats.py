@@ -21,6 +21,7 @@ from other_tools import (
     pictures,
     storage,
     storage_pair,
+    text_of,
     views,
     write_3dgs,
     write_kitti,
@@ -115,6 +116,20 @@ def test_a_calibration_file_stands_for_its_folder(tmp_path, rig, name):
     expected = WRITERS[name](tmp_path, rig)
     files = [f for f in [*calibrations(tmp_path), *tmp_path.glob("*.npy")] if f.name not in ("list.txt", "rgb.txt", "camera.txt")]
     check(mvcore.load(files[0]), expected)
+
+
+def test_nvm_with_matrices_and_blanks_in_names(tmp_path, rig):
+    expected = WRITERS["VisualSFM"](tmp_path, rig)
+    lines = (tmp_path / "scene.nvm").read_text().splitlines()
+    lines[0] = "NVM_V3_R9T"
+    for n, (r, c) in enumerate(rig):
+        _, f, *_, radial, zero = lines[3 + n].split()
+        lines[3 + n] = f'my"photos\\a"{n}.png {f} {text_of([*r.ravel(), *(-r @ c)])} {radial} {zero}'
+        (tmp_path / "photos" / f"a{n}.png").rename(tmp_path / "photos" / f"a {n}.png")
+    (tmp_path / "scene.nvm").write_text("\n".join(lines))
+    scene = mvcore.load(tmp_path)
+    check(scene, expected)
+    assert [f.name for f in scene.frames] == [f"a {n}.png" for n in range(len(rig))]
 
 
 @pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 0), (1, 2, 1), (1, 2, 2), (1, 2, 5)])

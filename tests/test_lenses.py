@@ -165,5 +165,8 @@ def test_a_field_of_view_needs_the_images_size(tmp_path):
         nerf(tmp_path, {"fl_x": None, "fl_y": None, "w": None, "h": None, "cx": None, "cy": None, "camera_angle_x": angle})
     )
     assert np.allclose(camera.calib[0].K, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
+    plain = {"fl_x": None, "fl_y": None, "cx": None, "cy": None}
+    degrees = mvcore.load(nerf(tmp_path, plain | {"x_fov": float(np.degrees(angle))}))  # instant-ngp's
+    assert np.allclose(degrees.calib[0].K, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
     with pytest.raises(FormatError, match="neither fl_x nor camera_angle_x"):
         mvcore.load(nerf(tmp_path, {"fl_x": None, "fl_y": None}))

@@ -27,6 +27,9 @@ def test_ten_comes_after_nine():
         (["cam0", "cam1", "cam2"], ["0003.jpg", "0001.jpg", "0002.jpg"], ["0001.jpg", "0002.jpg", "0003.jpg"]),
         (["a", "b"], ["x10.png", "x9.png"], ["x9.png", "x10.png"]),
         (["a", "b"], ["b.png", "c.png", "a.png"], ["a.png", "b.png"]),
+        (["left.jpg", "top.jpg"], ["top_mask.png", "a_mask.png", "left_mask.png"], ["left_mask.png", "top_mask.png"]),
+        (["left.jpg", "top.jpg"], ["mask-top.png", "Mask-Left.png"], ["Mask-Left.png", "mask-top.png"]),
+        (["mask.jpg", "b.jpg"], ["b.png", "mask.png"], ["mask.png", "b.png"]),
     ],
 )
 def test_pairs(names, files, expected):
@@ -42,6 +45,11 @@ def test_names_that_fit_partly_are_refused_or_left_out():
         paired(["a", "b", "c"], ["x.png", "y.png"], partial=True)
     with pytest.raises(FormatError, match="2 of 2 have none"):
         paired(["a", "b"], ["x.png", "y.png"], exact=True)
+
+
+def test_words_for_masks_count_of_masks_alone():
+    with pytest.raises(FormatError, match="2 of 2 have none"):
+        pair_by_name(["left.jpg", "top.jpg"], [Path("left_mask.png"), Path("top_mask.png"), Path("x.png")], "image", exact=True)
 
 
 def test_two_files_for_one_name_are_refused():

@@ -105,9 +105,9 @@ def test_masks_that_are_empty_inverted_or_of_another_size(scene):
 
     assert not [w for w in look([disc] * 12).warnings if w.startswith("masks")]
     assert any("inverted" in w for w in look([255 - disc] * 12).warnings)
-    assert any("1 of 12 masks are empty (3)" in w for w in look([disc] * 3 + [0 * disc] + [disc] * 8).warnings)
+    assert any("masks: 1 of 12 are empty (3)" in w for w in look([disc] * 3 + [0 * disc] + [disc] * 8).warnings)
     assert any("all are empty" in e for e in look([0 * disc] * 12).errors)
-    assert any("no mask" in w for w in look([disc] * 11 + [None]).warnings)
+    assert any("views have none" in w for w in look([disc] * 11 + [None]).warnings)
     assert look([np.kron(disc, np.ones((2, 2), np.uint8))] * 12).errors == []
     assert len(look([disc[:50]] * 12).errors) == 12
     assert "expected 12" in look([disc] * 3).errors[0]

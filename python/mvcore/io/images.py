@@ -194,12 +194,12 @@ def mask_warnings(masks: Sequence[NDArray[np.uint8] | None]) -> list[str]:
     present = [(n, m > 127) for n, m in enumerate(masks) if m is not None and not (m > 127).all()]
     if len(present) < len(masks):
         missing = sorted(set(range(len(masks))) - {n for n, _ in present})
-        messages.append(f"{len(missing)} of {len(masks)} views have no mask, or one that is all target ({_some(missing)})")
+        messages.append(f"masks: {len(missing)} of {len(masks)} views have none, or one that is all target ({_some(missing)})")
     if empty := [n for n, m in present if not m.any()]:
-        messages.append(f"{len(empty)} of {len(masks)} masks are empty ({_some(empty)})")
+        messages.append(f"masks: {len(empty)} of {len(masks)} are empty ({_some(empty)})")
     excess = [_border(m) - float(m.mean()) for _, m in present if m.any()]
     if excess and np.median(excess) > INVERTED:
-        messages.append("masks look inverted: they fill the images' borders more than their inside; the target must be bright")
+        messages.append("masks: they look inverted: they fill the images' borders more than their inside; the target must be bright")
     return messages
 
 

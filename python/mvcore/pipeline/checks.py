@@ -142,8 +142,7 @@ def check_masks(
                 looked.append(None if each[n] is None else load_mask(each[n], cameras[n], n))
         except (MvcoreError, OSError) as error:
             notes.error(view_name(cameras[n], n), error)
-    for message in mask_warnings(looked):
-        notes.warn("masks", message)
+    notes.warn_all(mask_warnings(looked))
     if looked and all(m is not None and not m.any() for m in looked):
         notes.error("masks", "all are empty: expected bright pixels where the target is")
 

@@ -1,4 +1,7 @@
-"""Kalibr ``camchain.yaml`` (or another name): a chain of cameras, ``T_cn_cnm1`` from the one before; the first is the world."""
+"""Kalibr ``camchain.yaml`` (or another name): a chain of cameras, ``T_cn_cnm1`` from the one before; the first is the world.
+
+OpenVINS' ``kalibr_imucam_chain.yaml`` has no chain but each camera's ``T_imu_cam`` (camera to IMU): there the IMU is the world.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import FormatError
+from ...errors import FormatError, InvalidInputError
 from ..limits import MOST_SIDE
 from .filestorage import read_yaml
+from .poses import from_camera_to_world
 from .records import Found, Record
 from .values import files_in
 
@@ -46,12 +50,30 @@ def read(path: Path) -> Found:
     if not chain or set(names) != set(chain):
         got = ", ".join(chain) or "none"
         raise FormatError(f"{path}: expected cameras cam0, cam1 ..., got {got:.80}")
-    records, pose = [], np.eye(4)
-    for n, name in enumerate(names):
-        if n:
-            pose = _array(path, name, chain[name], "T_cn_cnm1", (4, 4)) @ pose
-        records.append(_record(path, name, chain[name], pose))
-    return Found(records, path)
+    poses = _poses(path, names, chain)
+    return Found([_record(path, name, chain[name], pose) for name, pose in zip(names, poses, strict=True)], path)
+
+
+def _poses(path: Path, names: list[str], chain: dict[str, Any]) -> list[np.ndarray]:
+    """World to camera: the first camera is the world, or the IMU where the file has no chain but ``T_cam_imu`` or ``T_imu_cam``."""
+    for key in ("T_cam_imu", "T_imu_cam"):
+        if all(isinstance(c, dict) and c.get(key) is not None for c in chain.values()) and not any(
+            "T_cn_cnm1" in c for c in chain.values()
+        ):
+            poses = [_array(path, n, chain[n], key, (4, 4)) for n in names]
+            return poses if key == "T_cam_imu" else [_inverse(path, n, p) for n, p in zip(names, poses, strict=True)]
+    out = [np.eye(4)]
+    for name in names[1:]:
+        out.append(_array(path, name, chain[name], "T_cn_cnm1", (4, 4)) @ out[-1])
+    return out
+
+
+def _inverse(path: Path, name: str, pose: np.ndarray) -> np.ndarray:
+    try:
+        r, t = from_camera_to_world(pose)
+    except InvalidInputError as error:
+        raise FormatError(f"{path}: {name}: T_imu_cam: {error}") from None
+    return np.vstack([np.column_stack([r, t]), [0, 0, 0, 1]])
 
 
 def _array(path: Path, name: str, camera: Any, key: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -92,8 +92,8 @@ def _record(path: Path, n: int, view: Any) -> Record:
     distortion = view.get("dist", view.get("dist_k1k2p1p2", ()))
     image = path_in(f"{where}: image", view.get("image"))
     return Record(
-        K=None if missing else numbers(f"{where}: K", view["K"], (3, 3)),
-        R=None if missing else numbers(f"{where}: R", view["R"], (3, 3)),
+        K=None if missing else numbers(f"{where}: K", view["K"], (3, 3), (9,)).reshape(3, 3),
+        R=None if missing else numbers(f"{where}: R", view["R"], (3, 3), (9,)).reshape(3, 3),
         t=None if missing else numbers(f"{where}: t", view["t"], (3,), (3, 1)).reshape(3),
         width=pixels(f"{where}: width", view.get("width")),
         height=pixels(f"{where}: height", view.get("height")),

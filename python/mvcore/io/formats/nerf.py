@@ -75,12 +75,18 @@ def _number(where: str, frame: dict[str, Any], key: str, default: float | None =
 def _matrix(where: str, frame: dict[str, Any], width: int, height: int) -> list[list[float]]:
     fx, fy = _number(where, frame, "fl_x"), _number(where, frame, "fl_y")
     if fx is None and fy is None:
-        fx, fy = (_focal(_number(where, frame, f"camera_angle_{a}"), side) for a, side in (("x", width), ("y", height)))
+        fx, fy = (_focal(_angle(where, frame, a), side) for a, side in (("x", width), ("y", height)))
     if fx is None and fy is None:
         raise FormatError(f"{where}: neither fl_x nor camera_angle_x (an angle of 0 to pi)")
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     cx, cy = _number(where, frame, "cx", width / 2), _number(where, frame, "cy", height / 2)
     return [[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]  # type: ignore[operator, list-item]
+
+
+def _angle(where: str, frame: dict[str, Any], axis: str) -> float | None:
+    """The field of view in radians; instant-ngp also takes degrees."""
+    degrees = _number(where, frame, f"{axis}_fov")
+    return _number(where, frame, f"camera_angle_{axis}", None if degrees is None else float(np.radians(degrees)))
 
 
 def _focal(angle: float | None, side: int) -> float | None:

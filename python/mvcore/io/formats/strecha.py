@@ -15,7 +15,8 @@ def find(path: Path) -> Path | None:
     """The folder of ``.camera`` files."""
     if path.is_file():
         return path.parent if path.suffix.lower() == ".camera" else None
-    return next((f for f in (path, path / "images", path / "cameras") if files_in(f, ".camera")), None)
+    folders = sorted(f for f in path.iterdir() if f.is_dir() and not f.name.startswith("."))
+    return next((f for f in (path, path / "images", path / "cameras", *folders) if files_in(f, ".camera")), None)
 
 
 def read(folder: Path) -> Found:
