@@ -1,5 +1,6 @@
 """Files of other tools, written here from their formats' equations: their own projection and that of the cameras read agree."""
 
+import json
 import random
 import shutil
 
@@ -204,6 +205,110 @@ def test_a_pycolmap_reconstruction(tmp_path, rig):
     with pytest.raises(InvalidInputError, match="images"):
         mvcore.load(reconstruction)
     assert len(mvcore.load(reconstruction, images=False)) == len(rig)
+
+
+ANIPOSELIB = """
+[cam_0]
+name = "A"
+size = [ 640, 480,]
+matrix = [ [ 610.5, 0.0, 321.25,], [ 0.0, 612.75, 239.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.21, 0.06, 0.001, -0.002, 0.013,]
+rotation = [ 0.1, -0.2, 0.05,]
+translation = [ 0.1, 0.2, 3.0,]
+
+[cam_1]
+name = "left cam"
+size = [ 640, 480,]
+matrix = [ [ 610.5, 0.0, 321.25,], [ 0.0, 612.75, 239.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.21, 0.0, 0.0, 0.0, 0.0,]
+rotation = [ 0.0, 1.2, -0.3,]
+translation = [ -0.4, 0.1, 2.5,]
+
+[cam_2]
+name = "fish"
+size = [ 640, 480,]
+matrix = [ [ 300.0, 0.0, 318.0,], [ 0.0, 301.5, 241.25,], [ 0.0, 0.0, 1.0,],]
+distortions = [ 0.05, -0.01, 0.002, 0.001,]
+rotation = [ -0.4, -0.9, 0.2,]
+translation = [ 0.3, -0.1, 2.0,]
+fisheye = true
+
+[metadata]
+adjusted = false
+error = 0.5
+"""
+ANIPOSE_POINTS = np.array([[0.25, -0.1, 0.4], [-0.5, 0.35, -0.2], [0.05, 0.45, 0.3]])
+ANIPOSE_PIXELS = [
+    [[369.62502727754656, 251.78584742562597], [239.3424118424291, 361.0135685582437], [332.7049049886745, 351.94295945027244]],
+    [[327.6788129057599, 210.15439229918036], [180.3023772504181, 363.0239656093906], [319.90652100525307, 354.9411996532673]],
+    [[334.63099943537173, 240.4913855110629], [351.03744443848166, 241.3617109173743], [331.4686613468376, 300.63491334527447]],
+]
+"""What CameraGroup.dump of aniposelib 0.8.0 wrote, and where CameraGroup.project saw the points."""
+
+
+def test_aniposelibs_own_file_and_projections(tmp_path):
+    (tmp_path / "calibration.toml").write_text(ANIPOSELIB)
+    scene = mvcore.load(tmp_path, images=False)
+    assert [c.name for c in scene.calib] == ["A", "left cam", "fish"]
+    check(scene, ANIPOSE_PIXELS, ANIPOSE_POINTS)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_nerfstudios_rays(tmp_path, rig, model):
+    """Its Cameras._generate_rays_from_coords, for pixel (row i, column j) at (i + 0.5, j + 0.5), with the lens of camera_utils."""
+    fisheye, rng = model == "OPENCV_FISHEYE", np.random.default_rng(2)
+    lens = {"k1": 0.05, "k2": -0.02, "k3": 0.004} | ({"k4": 0.001} if fisheye else {"p1": 0.002, "p2": -0.001})
+    value = lambda key: lens.get(key, 0.0)  # noqa: E731
+    frames, points, pixels = [], [], []
+    for n, (r, c) in enumerate(rig):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = r.T @ np.diag([1.0, -1, -1]), c
+        frames.append({"file_path": f"./images/{n}", "transform_matrix": pose.tolist()})
+        x, y = rng.uniform([-0.5, -0.35], [0.5, 0.35], (30, 2)).T  # undistorted
+        s = x * x + y * y
+        d = 1 + s * (value("k1") + s * (value("k2") + s * (value("k3") + s * value("k4"))))
+        u = d * x + 2 * value("p1") * x * y + value("p2") * (s + 2 * x * x)
+        v = d * y + 2 * value("p2") * x * y + value("p1") * (s + 2 * y * y)
+        angle = np.sqrt(s)
+        turn = np.sin(angle) / angle if fisheye else np.ones_like(s)
+        rays = np.column_stack([x * turn, -y * turn, -np.cos(angle) if fisheye else -np.ones_like(s)])
+        points.append(c + 1.7 * rays @ pose[:3, :3].T)
+        pixels.append(np.column_stack([u * F + 32.25, v * (F + 1) + 23]) - 0.5)
+    pictures(tmp_path / "images", [f"{n}.png" for n in range(len(rig))])
+    data = {"camera_model": model, "fl_x": F, "fl_y": F + 1, "cx": 32.25, "cy": 23, "w": SIZE[0], "h": SIZE[1], **lens, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    for camera, seen_at, there in zip(mvcore.load(tmp_path).calib, pixels, points):
+        assert np.abs(seen(camera, there) - seen_at).max() < EXACT
+
+
+def test_kalibrs_equations(tmp_path):
+    """aslam_cv: RadialTangentialDistortion.hpp and EquidistantDistortion.hpp, distort(y), and the wiki's T_cn_cnm1."""
+    chain, out, pose = {}, [], np.eye(4)
+    for n, kind in enumerate(("radtan", "equidistant", "none")):
+        step = np.vstack([np.column_stack([cv2.Rodrigues(np.array([0.02, -0.1, 0.03]) * n)[0], [-0.3 * n, 0.02, 0.01]]), [0, 0, 0, 1]])
+        pose = step @ pose if n else pose
+        q = AHEAD @ pose[:3, :3].T + pose[:3, 3]
+        y = q[:, :2] / q[:, 2:]
+        if kind == "radtan":
+            k1, k2, p1, p2 = d = [-0.1, 0.03, 0.002, -0.001]
+            mx2, my2, mxy = y[:, 0] ** 2, y[:, 1] ** 2, y[:, 0] * y[:, 1]
+            rho2 = mx2 + my2
+            radial = k1 * rho2 + k2 * rho2**2
+            shift = [y[:, 0] * radial + 2 * p1 * mxy + p2 * (rho2 + 2 * mx2), y[:, 1] * radial + 2 * p2 * mxy + p1 * (rho2 + 2 * my2)]
+            y = y + np.column_stack(shift)
+        elif kind == "equidistant":
+            k1, k2, k3, k4 = d = [0.05, 0.01, 0.002, 0.001]
+            r = np.sqrt((y**2).sum(1))
+            theta = np.arctan(r)
+            y = y * (theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) / r)[:, None]
+        else:
+            d = []
+        chain[f"cam{n}"] = {"camera_model": "pinhole", "distortion_model": kind, "distortion_coeffs": d, "resolution": list(SIZE)}
+        chain[f"cam{n}"] |= {"intrinsics": [F, F + 1, 31.0, 23.0], "rostopic": f"/cam{n}"} | ({"T_cn_cnm1": step.tolist()} if n else {})
+        out.append(y * [F, F + 1] + [31, 23])
+    pictures(tmp_path, [f"cam{n}.png" for n in range(3)])
+    (tmp_path / "log-camchain.yaml").write_text(json.dumps(chain))
+    check(mvcore.load(tmp_path), out, AHEAD)
 
 
 def test_colmap_comes_before_the_cameras_of_a_splatting_run(tmp_path, rig):
