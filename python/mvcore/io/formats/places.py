@@ -22,6 +22,7 @@ from ...errors import FormatError
 from ..pairing import natural_order, pair_by_name
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".exr", ".heic", ".heif")
+SUFFIXES = (*IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES))
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "color", "photos", "frames", "blended_images", "undistorted", "undistorted_images")
 """Usual names of folders of images, the surest first."""
 MASK_FOLDERS = ("masks", "mask", "silhouettes", "mattes")
@@ -196,8 +197,8 @@ def with_suffix(path: Path) -> Path | None:
     """An image's path as it is, or with a usual suffix added; None where there is no such file."""
     if path.suffix.lower() in IMAGE_SUFFIXES:
         return path if _is_file(path) else None
-    names = (path.name + s for suffix in IMAGE_SUFFIXES for s in (suffix, suffix.upper()))
-    return next((p for n in names if _is_file(p := path.with_name(n))), None) if path.name else None
+    text = str(path)
+    return next((Path(text + s) for s in SUFFIXES if os.path.isfile(text + s)), None) if path.name else None
 
 
 def _is_file(path: Path) -> bool:
