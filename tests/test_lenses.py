@@ -128,6 +128,14 @@ def nerf(folder, common, **frame):
     return folder
 
 
+def test_the_only_transforms_file_is_read_under_any_name(tmp_path):
+    (nerf(tmp_path, {}) / "transforms.json").rename(tmp_path / "transforms_test.json")
+    assert len(mvcore.load(tmp_path)) == 2
+    (tmp_path / "transforms_val.json").write_text("{}")
+    with pytest.raises(FormatError, match="no calibration found"):
+        mvcore.load(tmp_path)
+
+
 def test_nerf_lenses(tmp_path):
     zero = mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV_FISHEYE"})).calib[0]
     assert zero.fisheye

@@ -127,7 +127,7 @@ def _full(path: PurePath, key: Key, folders: int) -> tuple[object, ...]:
 
 
 def _closest(name: PurePath, files: Sequence[Path]) -> list[Path]:
-    """The files that share the most folders with a name."""
+    """The files that share the most folders with a name; of those the ones in the fewest folders (not ``old/a.png`` beside ``a.png``)."""
     folders = [p.casefold() for p in name.parent.parts]
 
     def shared(file: Path) -> int:
@@ -138,7 +138,9 @@ def _closest(name: PurePath, files: Sequence[Path]) -> list[Path]:
         return count
 
     most = max(map(shared, files))
-    return [f for f in files if shared(f) == most]
+    closest = [f for f in files if shared(f) == most]
+    least = min(len(f.parts) for f in closest)
+    return [f for f in closest if len(f.parts) == least]
 
 
 def _stem(path: PurePath) -> str:

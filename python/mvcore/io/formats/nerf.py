@@ -18,6 +18,7 @@ from .lens import brown, corner_radius, polynomial
 from .native import numbers, path_in, pixels
 from .places import named
 from .records import Found, Record
+from .values import files_in
 
 NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -25,10 +26,11 @@ FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE
 
 
 def find(path: Path) -> Path | None:
-    """The file, if the path is one or holds one."""
+    """The file, if the path is one or holds one; of other names (``transforms_test.json``) the only one."""
     if path.is_file():
         return path if path.name.lower().startswith("transforms") and path.suffix.lower() == ".json" else None
-    return named(path, *NAMES)
+    others = [f for f in files_in(path, ".json") if f.name.lower().startswith("transforms")]
+    return named(path, *NAMES) or (others[0] if len(others) == 1 else None)
 
 
 def read(path: Path) -> Found:
