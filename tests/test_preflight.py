@@ -117,6 +117,7 @@ def test_masks_that_are_empty_inverted_or_of_another_size(scene):
 def test_bounds_must_be_a_box_that_is_seen():
     cameras = rig(4)
     assert preflight(None, cameras, bounds=[-1, -1, -1, 1, 1, 1]).errors == []
+    assert preflight(None, cameras, bounds=[-3100, -5000, -70, 5000, 3300, 90]).errors == []  # a city, of which they see a place
     for box, part in (
         ([1, 2], "2 values"),
         ([1, 1, 1, 0, 0, 0], "x0 < x1"),

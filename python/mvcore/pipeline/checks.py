@@ -176,18 +176,17 @@ def check_bounds(bounds: ArrayLike | None, cameras: Sequence[Camera], notes: Fin
         return
     if box is None:
         return
-    corners = np.stack(np.meshgrid(*[np.linspace(*side, 5) for side in box.T], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
     if len(cameras) and not any(_sees(c, corners) for c in cameras):
         notes.error("bounds", f"no camera sees the box {box.tolist()}: expected the world's units and axes")
 
 
-def _sees(camera: Camera, points: NDArray[np.float64]) -> bool:
-    local = camera.to_camera(points)
+def _sees(camera: Camera, corners: NDArray[np.float64]) -> bool:
+    """Whether a camera may see a box: no side of its view has all corners outside. Sure where it says no."""
+    local = camera.to_camera(corners)
     x = local @ camera.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = x[:, 0] / x[:, 2], x[:, 1] / x[:, 2]
-        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    return bool(inside.any())
+    inside = (local[:, 2], x[:, 0], camera.width * x[:, 2] - x[:, 0], x[:, 1], camera.height * x[:, 2] - x[:, 1])
+    return all(bool((side > 0).any()) for side in inside)
 
 
 def check_places(outputs: Sequence[str | Path], folders: Sequence[str | Path], notes: Findings) -> None:
