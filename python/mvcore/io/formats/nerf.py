@@ -122,5 +122,5 @@ def _four_terms(where: str, frame: dict[str, Any], width: int, height: int, radi
     values = polynomial(radial, p1, p2, float(matrix[0, 0]), corner_radius(matrix, width, height))
     if values is None:
         text = ", ".join(f"{v:g}" for v in radial)
-        raise FormatError(f"{where}: k1 .. k4: no such perspective lens, its distortion turns back in the image ({text}); is it a fisheye?")
+        raise FormatError(f"{where}: k1 .. k4: expected a distortion that does not turn back in the image, got {text}; is it a fisheye?")
     return values
