@@ -96,3 +96,14 @@ def test_each_setting_says_why():
         body = source[source.index(f"class {SECTIONS[section].__name__}(") :]
         assert re.search(rf'\n    {name}: [^\n]+\n    """', body), f"{section}.{name}"
     assert issubclass(Config, Checked)
+
+
+def test_files_of_settings_as_windows_editors_write_them(tmp_path):
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf[depth]\r\nsources = 3\r\n")
+    (tmp_path / "A.JSON").write_bytes(b'\xef\xbb\xbf{"depth": {"sources": 3}}\r\n')
+    for name in ("a.toml", "A.JSON"):
+        assert Config.from_file(tmp_path / name).depth.sources == 3
+    for name, text in (("deep.toml", "a = " + "[" * 50_000), ("deep.json", "[" * 50_000), ("latin.toml", "a = '\xe4'")):
+        (tmp_path / name).write_bytes(text.encode("latin-1"))
+        with pytest.raises(FormatError, match=rf"{name}: not a (TOML|JSON) file"):
+            Config.from_file(tmp_path / name)

@@ -207,6 +207,6 @@ def test_what_is_suspicious_about_masks():
     assert mask_warnings([good, cut, good]) == []
     assert mask_warnings([cut] * 3) == []
     assert "inverted" in mask_warnings([inverted] * 3)[0]
-    assert "1 of 3 views have no mask, or one that is all target (1)" in mask_warnings([good, None, good])[0]
+    assert "masks: 1 of 3 views have none, or one that is all target (1)" in mask_warnings([good, None, good])[0]
     assert "2 of 3 views" in mask_warnings([good, full, None])[0]
-    assert "1 of 2 masks are empty (1)" in mask_warnings([good, 0 * good])[0]
+    assert "masks: 1 of 2 are empty (1)" in mask_warnings([good, 0 * good])[0]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mvcore import Camera, FormatError
 from mvcore.io.formats.colmap import COUNTS, MODELS, SUPPORTED
+from mvcore.io.formats.lens import TOLERANCE
 from mvcore.io.images import distorted_pixels, undistort
 
 COEFFICIENTS = {
@@ -99,6 +100,21 @@ def test_undistorted_images_are_what_a_pinhole_sees(fisheye, distortion, skew):
     assert np.abs(flat[inside] - (127 + 60 * np.sin(seen[inside] / 25))).max() < 2  # grey levels: rounding and interpolation
 
 
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_images_larger_than_opencv_remaps_are_undistorted_in_parts(monkeypatch, fisheye):
+    camera = Camera([[300, 0, 160], [0, 310, 120], [0, 0, 1]], np.eye(3), np.zeros(3), 320, 240, [0.03, -0.01, 0, 0], fisheye)
+    image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
+    whole = undistort(image, camera)
+    monkeypatch.setattr("mvcore.io.images.PART", 50)
+    monkeypatch.setattr("mvcore.io.images.MOST_SIDE", 230)
+    np.testing.assert_array_equal(undistort(image, camera), whole)
+    monkeypatch.undo()
+    wide = Camera([[3e4, 0, 16500], [0, 3e4, 20], [0, 0, 1]], np.eye(3), np.zeros(3), 33000, 40, [-0.1, 0, 0, 0])
+    steps = np.repeat(np.arange(33000)[None] // 200, 40, 0).astype(np.uint8)
+    seen = distorted_pixels(wide, [[32000, 20]])[0, 0]
+    assert undistort(steps, wide)[20, 32000] == pytest.approx(seen // 200, abs=1)
+
+
 def nerf(folder, common, **frame):
     (folder / "images").mkdir(exist_ok=True)
     frames = []
@@ -112,6 +128,14 @@ def nerf(folder, common, **frame):
     return folder
 
 
+def test_the_only_transforms_file_is_read_under_any_name(tmp_path):
+    (nerf(tmp_path, {}) / "transforms.json").rename(tmp_path / "transforms_test.json")
+    assert len(mvcore.load(tmp_path)) == 2
+    (tmp_path / "transforms_val.json").write_text("{}")
+    with pytest.raises(FormatError, match="no calibration found"):
+        mvcore.load(tmp_path)
+
+
 def test_nerf_lenses(tmp_path):
     zero = mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV_FISHEYE"})).calib[0]
     assert zero.fisheye
@@ -122,11 +146,42 @@ def test_nerf_lenses(tmp_path):
     assert not mvcore.load(nerf(tmp_path, {"is_fisheye": False})).calib[0].distorted
     plain = mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV", "k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5})).calib[0]
     assert plain.distortion.tolist() == [0.1, 0.2, 0.3, 0.4, 0.5]
-    with pytest.raises(FormatError, match=r"frames\[0\]: k4"):
-        mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV", "k4": 0.2}))
+    with pytest.raises(
+        FormatError, match=r"frames\[0\]: k1 .. k4: expected a distortion that does not turn back in the image, got -2, 0, 0, 0.2"
+    ):
+        mvcore.load(nerf(tmp_path, {"camera_model": "OPENCV", "k1": -2.0, "k4": 0.2}))
     for model in ("EQUIRECTANGULAR", "FISHEYE624"):
         with pytest.raises(FormatError, match=f"camera_model '{model}' is not supported"):
             mvcore.load(nerf(tmp_path, {}, camera_model=model))
+
+
+@pytest.mark.parametrize(("k", "sized", "tolerance"), [((-0.1, 0.02, 0.001, 0.2), True, TOLERANCE), ((0.05, 0.0, 0.0, -0.02), False, 1e-6)])
+def test_nerfstudios_fourth_radial_term(tmp_path, k, sized, tolerance):
+    """Its radial_and_tangential_undistort: d = 1 + r (k1 + r (k2 + r (k3 + r k4))) with r = x² + y²; p1 and p2 as OpenCV's."""
+    lens = dict(zip(("k1", "k2", "k3", "k4"), k)) | {"p1": 0.002, "p2": -0.001}
+    camera = mvcore.load(nerf(tmp_path, lens | ({} if sized else {"w": None, "h": None}))).calib[0]
+    x, y = np.random.default_rng(0).uniform([-0.5, -0.35], [0.5, 0.35], (200, 2)).T
+    r = x * x + y * y
+    d = 1 + r * (k[0] + r * (k[1] + r * (k[2] + r * k[3])))
+    u = d * x + 2 * 0.002 * x * y - 0.001 * (r + 2 * x * x)
+    v = d * y - 2 * 0.001 * x * y + 0.002 * (r + 2 * y * y)
+    pixels = distorted_pixels(camera, np.column_stack([60 * x + 31.5, 61 * y + 23.5]))
+    assert np.abs(pixels - np.column_stack([60 * u + 31.5, 61 * v + 23.5])).max() < tolerance
+
+
+def test_a_lens_that_is_hard_to_fit(tmp_path):
+    """Four terms of one sign and size at a long focal length: within the fit's tolerance, not refused."""
+    folder = nerf(
+        tmp_path,
+        {"k1": -0.1, "k2": 0.02, "k3": 0.001, "k4": 0.2, "fl_x": 287.0, "fl_y": 288.0, "cx": 158.5, "cy": 104.9, "w": 320, "h": 213},
+    )
+    for n in range(2):
+        cv2.imwrite(str(folder / "images" / f"{n}.png"), np.zeros((213, 320, 3), np.uint8))
+    camera = mvcore.load(folder).calib[0]
+    x = np.linspace(0, 0.5, 100)
+    expected = 287 * x * (1 - 0.1 * x**2 + 0.02 * x**4 + 0.001 * x**6 + 0.2 * x**8) + 158
+    pixels = distorted_pixels(camera, np.column_stack([287 * x + 158, np.full(100, 104.4)]))
+    assert np.abs(pixels[:, 0] - expected).max() < TOLERANCE
 
 
 def test_a_field_of_view_needs_the_images_size(tmp_path):
@@ -135,5 +190,8 @@ def test_a_field_of_view_needs_the_images_size(tmp_path):
         nerf(tmp_path, {"fl_x": None, "fl_y": None, "w": None, "h": None, "cx": None, "cy": None, "camera_angle_x": angle})
     )
     assert np.allclose(camera.calib[0].K, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
+    plain = {"fl_x": None, "fl_y": None, "cx": None, "cy": None}
+    degrees = mvcore.load(nerf(tmp_path, plain | {"x_fov": float(np.degrees(angle))}))  # instant-ngp's
+    assert np.allclose(degrees.calib[0].K, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
     with pytest.raises(FormatError, match="neither fl_x nor camera_angle_x"):
         mvcore.load(nerf(tmp_path, {"fl_x": None, "fl_y": None}))

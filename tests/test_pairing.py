@@ -27,6 +27,10 @@ def test_ten_comes_after_nine():
         (["cam0", "cam1", "cam2"], ["0003.jpg", "0001.jpg", "0002.jpg"], ["0001.jpg", "0002.jpg", "0003.jpg"]),
         (["a", "b"], ["x10.png", "x9.png"], ["x9.png", "x10.png"]),
         (["a", "b"], ["b.png", "c.png", "a.png"], ["a.png", "b.png"]),
+        (["a.jpg", "b.jpg"], ["m/a.png", "m/old/a.png", "m/b.png", "m/old/b.png"], ["m/a.png", "m/b.png"]),
+        (["left.jpg", "top.jpg"], ["top_mask.png", "a_mask.png", "left_mask.png"], ["left_mask.png", "top_mask.png"]),
+        (["left.jpg", "top.jpg"], ["mask-top.png", "Mask-Left.png"], ["Mask-Left.png", "mask-top.png"]),
+        (["mask.jpg", "b.jpg"], ["b.png", "mask.png"], ["mask.png", "b.png"]),
     ],
 )
 def test_pairs(names, files, expected):
@@ -44,8 +48,15 @@ def test_names_that_fit_partly_are_refused_or_left_out():
         paired(["a", "b"], ["x.png", "y.png"], exact=True)
 
 
+def test_words_for_masks_count_of_masks_alone():
+    with pytest.raises(FormatError, match="2 of 2 have none"):
+        pair_by_name(["left.jpg", "top.jpg"], [Path("left_mask.png"), Path("top_mask.png"), Path("x.png")], "image", exact=True)
+
+
 def test_two_files_for_one_name_are_refused():
     with pytest.raises(FormatError, match=r"left: expected one mask, got left.avi and left.mp4"):
         paired(["left", "right"], ["left.mp4", "left.avi", "right.mp4"])
+    with pytest.raises(FormatError, match=r"a.jpg: expected one mask, got m/new/a.png and m/old/a.png"):
+        paired(["a.jpg", "b.jpg"], ["m/new/a.png", "m/old/a.png", "m/b.png"])
     with pytest.raises(FormatError, match="belongs to both"):
         paired(["v1.jpg", "v01.jpg"], ["1.png", "2.png", "3.png"])

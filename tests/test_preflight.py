@@ -105,9 +105,9 @@ def test_masks_that_are_empty_inverted_or_of_another_size(scene):
 
     assert not [w for w in look([disc] * 12).warnings if w.startswith("masks")]
     assert any("inverted" in w for w in look([255 - disc] * 12).warnings)
-    assert any("1 of 12 masks are empty (3)" in w for w in look([disc] * 3 + [0 * disc] + [disc] * 8).warnings)
+    assert any("masks: 1 of 12 are empty (3)" in w for w in look([disc] * 3 + [0 * disc] + [disc] * 8).warnings)
     assert any("all are empty" in e for e in look([0 * disc] * 12).errors)
-    assert any("no mask" in w for w in look([disc] * 11 + [None]).warnings)
+    assert any("views have none" in w for w in look([disc] * 11 + [None]).warnings)
     assert look([np.kron(disc, np.ones((2, 2), np.uint8))] * 12).errors == []
     assert len(look([disc[:50]] * 12).errors) == 12
     assert "expected 12" in look([disc] * 3).errors[0]
@@ -117,6 +117,7 @@ def test_masks_that_are_empty_inverted_or_of_another_size(scene):
 def test_bounds_must_be_a_box_that_is_seen():
     cameras = rig(4)
     assert preflight(None, cameras, bounds=[-1, -1, -1, 1, 1, 1]).errors == []
+    assert preflight(None, cameras, bounds=[-3100, -5000, -70, 5000, 3300, 90]).errors == []  # a city, of which they see a place
     for box, part in (
         ([1, 2], "2 values"),
         ([1, 1, 1, 0, 0, 0], "x0 < x1"),
@@ -200,3 +201,73 @@ def test_what_cannot_be_read_is_an_error_not_an_exception(tmp_path):
     assert "no such file or folder" in mvcore.check(tmp_path / "nowhere", outputs=[tmp_path]).errors[0]
     assert len(mvcore.check(tmp_path / "nowhere", outputs=[tmp_path]).errors) == 2
     assert mvcore.check(tmp_path).errors
+
+
+class Worked(Exception):
+    """Work began."""
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    def begin(*_, **__):
+        raise Worked
+
+    monkeypatch.setattr("mvcore.pipeline.reconstruct.open_session", begin)
+    monkeypatch.setattr("mvcore.video.run.open_session", begin)
+    monkeypatch.setattr("mvcore.io.images.decode", begin)  # of an image or mask
+
+
+def test_calls_from_python_are_checked_before_any_work(scene, tmp_path, monkeypatch, no_work):
+    found = mvcore.load(scene)
+    frames = list(found.frames)
+    with pytest.raises(Worked):
+        mvcore.reconstruct(found, masks=scene / "masks", workdir=tmp_path / "work", bounds=[-1, -1, -1, 1, 1, 1])
+    assert not (tmp_path / "work").exists()
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((12, 16), np.uint8))
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "text.png").write_text("x")
+    arrays = [np.zeros((120, 160, 3), np.uint8)] * 11
+    for message, changed in (
+        (r"view 0 \(.*gone.png: no such image", {"frames": [tmp_path / "gone.png", *frames[1:]]}),
+        (
+            r"view 3 \(.*expected 160 x 120 pixels as its camera, got 16 x 12 \(and 1 more",
+            {"frames": [*arrays[:3], *[tmp_path / "small.png"] * 2, *arrays[4:]]},
+        ),
+        (r"text.png: not an image", {"frames": [tmp_path / "text.png", *frames[1:]]}),
+        (r"frames\[11\]: expected \(h, w, 3\) of uint8", {"frames": [*arrays, np.zeros((120, 160))]}),
+        (r"view 0 \(.*text.png: not an image", {"masks": [tmp_path / "text.png", *[None] * 11]}),
+        (r"bounds: no camera sees the box", {"bounds": [900, 900, 900, 901, 901, 901]}),
+        (r"file: expected a folder that can be written, got a file", {"workdir": tmp_path / "file"}),
+        (r"device: expected a CUDA device", {"config": {"device": "cuda"}}),
+    ):
+        monkeypatch.setattr("mvcore.network.devices.cuda_available", lambda: False)
+        arguments = {"frames": frames, "calib": found.calib} | changed
+        with pytest.raises(InvalidInputError, match=message):
+            mvcore.reconstruct(arguments.pop("frames"), arguments.pop("calib"), **arguments)
+    with pytest.raises(Worked):  # the device is the workers'
+        mvcore.reconstruct(found, config={"device": "cuda"}, scheduler="tcp://host:1")
+
+
+def test_clips_from_python_are_checked_before_any_work(tmp_path, monkeypatch):
+    write_clips(tmp_path / "set", rig(3), [np.eye(4)] * 3)
+    clips = load_video(tmp_path / "set")
+    monkeypatch.setattr("mvcore.network.devices.cuda_available", lambda: False)
+    (tmp_path / "file").write_text("x")
+    for message, changed in (
+        (r"bounds: no camera sees the box", {"bounds": [900, 900, 900, 901, 901, 901]}),
+        (r"file: expected a folder that can be written, got a file", {"workdir": tmp_path / "file"}),
+        (r"device: expected a CUDA device", {"config": {"device": "cuda"}}),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            mvcore.reconstruct_video(clips, **changed)
+    (tmp_path / "set" / "images" / "cam01" / "frame0002.png").write_bytes(b"damaged")
+    with pytest.raises(InvalidInputError, match=r"cam01: .*frame0002.png: not an image"):
+        mvcore.reconstruct_video(clips)
+
+
+def test_what_a_preflight_notices_is_in_the_report(ring):
+    cameras, images, _, _ = ring
+    wide = [replace(c, K=c.K * np.array([[1.4], [1], [1]])) for c in cameras]
+    config = {"depth": {"max_image_size": 48}}
+    result = mvcore.reconstruct(images, wide, config=config)
+    assert any("differ by more than a quarter" in w for w in result.report["warnings"])

@@ -1,5 +1,7 @@
 """Calibrations that name cameras and no images, as rigs write them: what lies where, and what is refused."""
 
+import json
+
 import cv2
 import mvcore
 import numpy as np
@@ -7,7 +9,6 @@ import pytest
 from conftest import rig
 from fuzz import seeds
 from mvcore.errors import FormatError
-from mvcore.io.formats.camera_folders import camera_image, plain_name
 from mvcore.io.scene import Scene
 
 
@@ -22,15 +23,20 @@ def picture(path):
     return path
 
 
-def test_where_a_cameras_image_lies(tmp_path):
-    for n, place in enumerate(("a.png", "images/a.png", "images/a/0.jpg", "a/0.jpg", "a/data/0.jpg")):
-        image = picture(tmp_path / str(n) / place)
-        assert camera_image(tmp_path / str(n), "a") == image
-    picture(tmp_path / "3" / "a" / "1.jpg")  # a clip
-    assert camera_image(tmp_path / "3", "a") is None
-    for name in ("", "..", "../a", "/etc/passwd", "a\0", "a\\b"):
-        assert not plain_name(name)
-        assert camera_image(tmp_path, name) is None
+@pytest.mark.parametrize("place", ["{}.png", "images/{}.png", "images/{}/0.jpg", "{}/0.jpg", "{}/data/0.jpg"])
+def test_where_a_cameras_image_lies(tmp_path, scene, place):
+    for n in range(3):
+        picture(tmp_path / f"{n}.png")
+    seeds._kalibr(tmp_path, scene)
+    for n in range(3):
+        (tmp_path / f"cam{n}.png").unlink()
+    images = [picture(tmp_path / place.format(f"cam{n}")) for n in range(3)]
+    assert list(mvcore.load(tmp_path).frames) == images
+    if "/0" in place:
+        picture(images[0].with_name("1.jpg"))
+        with pytest.raises(FormatError, match="several instants are a clip"):
+            mvcore.load(tmp_path)
+        assert len(mvcore.load(tmp_path, images=False)) == 3
 
 
 def test_easymocap_with_one_image_a_camera_and_names_without_quotes(tmp_path, scene):
@@ -50,9 +56,10 @@ def test_easymocap_with_one_image_a_camera_and_names_without_quotes(tmp_path, sc
     for a, b in zip(read.calib, scene.calib):
         np.testing.assert_allclose(a.project([[0.1, 0.2, 0.3]]), b.project([[0.1, 0.2, 0.3]]), atol=1e-9)
     text = (tmp_path / "intri.yml").read_text()
-    (tmp_path / "intri.yml").write_text(text.replace("- 00", "- ../00"))
-    with pytest.raises(FormatError, match=r"intri\.yml: expected a list 'names' of cameras"):
-        mvcore.load(tmp_path)
+    for name in ('""', '".."', '"../a"', "/etc/passwd", "a\\\\b"):
+        (tmp_path / "intri.yml").write_text(text.replace("- 00", f"- {name}"))
+        with pytest.raises(FormatError, match=r"intri\.yml: expected a list 'names' of cameras"):
+            mvcore.load(tmp_path)
     (tmp_path / "intri.yml").write_text(text.replace("W_01: 32", "W_01: 1e300"))
     with pytest.raises(FormatError, match=r"intri\.yml: W_01: expected a number of pixels"):
         mvcore.load(tmp_path)
@@ -81,6 +88,50 @@ def test_kalibr_by_its_content_and_a_fisheye_without_distortion(tmp_path, scene)
         (tmp_path / "result.yaml").write_text(text.replace(old, new))
         with pytest.raises(FormatError, match=rf"result\.yaml: .*{message}"):
             mvcore.load(tmp_path / "result.yaml")
+
+
+@pytest.mark.parametrize("key", ["T_imu_cam", "T_cam_imu"])
+def test_openvins_chain_of_cameras_and_an_imu(tmp_path, scene, key):
+    for n in range(3):
+        picture(tmp_path / f"{n}.png")
+    seeds._kalibr(tmp_path, scene)
+    text, imu = "%YAML:1.0\n\n", np.vstack([np.column_stack([cv2.Rodrigues(np.array([0.3, 1, -2]))[0], [1, 2, 3]]), [0, 0, 0, 1]])
+    for n, c in enumerate(scene.calib):  # the IMU in the world: X_imu = imu X
+        pose = np.vstack([np.column_stack([c.R, c.t]), [0, 0, 0, 1]]) @ np.linalg.inv(imu)
+        rows = (pose if key == "T_cam_imu" else np.linalg.inv(pose)).tolist()
+        text += f"cam{n}:\n  {key}: #a comment\n" + "".join(f"    - {row}\n" for row in rows)
+        text += "  cam_overlaps: [1]\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: [0.1, 0.0, 0.0, 0.0]\n"
+        text += f"  intrinsics: {[*map(float, c.K[[0, 1, 0, 1], [0, 1, 2, 2]])]}\n  resolution: [{c.width}, {c.height}]\n"
+        text += f"  rostopic: /cam{n}/image_raw\n  timeshift_cam_imu: 0.01\n"
+    (tmp_path / "camchain.yaml").rename(tmp_path / "old.txt")
+    (tmp_path / "kalibr_imucam_chain.yaml").write_text(text)
+    point = np.array([0.1, 0.2, 0.3])
+    for a, b in zip(mvcore.load(tmp_path).calib, scene.calib):
+        np.testing.assert_allclose(a.project([imu[:3, :3] @ point + imu[:3, 3]]), b.project([point]), atol=1e-9)
+    (tmp_path / "kalibr_imucam_chain.yaml").write_text(text.replace(key, "T_xyz", 1))
+    with pytest.raises(FormatError, match="cam1: T_cn_cnm1: expected 4 x 4 finite numbers"):
+        mvcore.load(tmp_path)
+
+
+def test_strechas_cameras_in_a_folder_of_their_own(tmp_path, scene):
+    for n in range(3):
+        picture(tmp_path / "fountain_dense_images" / f"{n}.png")
+    (tmp_path / "fountain_dense_cameras").mkdir()
+    seeds._strecha(tmp_path / "fountain_dense_cameras", scene)
+    read = mvcore.load(tmp_path)
+    assert [f.relative_to(tmp_path).as_posix() for f in read.frames] == [f"fountain_dense_images/{n}.png" for n in range(3)]
+    for a, b in zip(read.calib, scene.calib):
+        np.testing.assert_allclose(a.project([[0.1, 0.2, 0.3]]), b.project([[0.1, 0.2, 0.3]]), atol=1e-5)
+
+
+def test_our_file_with_matrices_as_lists(tmp_path, scene):
+    views = []
+    for n, c in enumerate(scene.calib):
+        picture(tmp_path / f"{n}.png")
+        views.append({"image": f"{n}.png", "K": c.K.ravel().tolist(), "R": c.R.ravel().tolist(), "t": c.t.tolist()})
+    (tmp_path / "cameras.json").write_text(json.dumps({"views": views}))
+    for a, b in zip(mvcore.load(tmp_path).calib, scene.calib):
+        np.testing.assert_allclose(a.projection, b.projection, atol=1e-12)
 
 
 def test_qualisys_images_and_numbers(tmp_path, scene):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import av
 import cv2
+import mvcore
 import numpy as np
 import pytest
 from conftest import look_at
@@ -13,6 +14,7 @@ from mvcore import FormatError, InvalidInputError
 from mvcore.io import load_video
 from mvcore.io.media import media_size
 from mvcore.io.streams import open_stream, video_frame
+from mvcore.video.api import _plates, with_calibration
 from PIL import Image
 
 SIZE = (64, 48)
@@ -231,3 +233,57 @@ def test_sizes_of_clips_beside_a_calibration(tmp_path):
     write_video(tmp_path / "videos" / "01.MTS", 12)
     assert media_size(tmp_path, "01") == SIZE
     assert media_size(tmp_path, "02") == (0, 0)
+
+
+@pytest.mark.parametrize(("orientation", "turn"), [(6, 3), (3, 2), (8, 1)])
+def test_clean_plates_are_turned_as_the_frames_are(tmp_path, orientation, turn):
+    """Beside the frames, in a folder of the caller's with and without a turn of its own, and with the turn left out."""
+    size = SIZE[::-1] if turn % 2 else SIZE
+    rng = np.random.default_rng(0)
+    plates = {name: rng.integers(0, 256, (SIZE[1] // 8, SIZE[0] // 8, 3), np.uint8).repeat(8, 0).repeat(8, 1) for name in "ab"}
+    for name, plate in plates.items():
+        (tmp_path / "images" / name).mkdir(parents=True)
+        (tmp_path / "upright").mkdir(exist_ok=True)
+        for file in ("0.png", "1.png", "background.png"):
+            image = Image.fromarray(plate if file == "background.png" else picture(1))
+            exif = image.getexif()
+            exif[0x0112] = orientation
+            image.save(tmp_path / "images" / name / file, exif=exif)
+        Image.fromarray(np.rot90(plate, turn)).save(tmp_path / "upright" / f"{name}.png")
+    clips = load_video(tmp_path, cameras("a", "b", size=size))
+    for given in (None, tmp_path / "upright", {n: tmp_path / "images" / n / "background.png" for n in "ab"}):
+        for found, name in zip(_plates(clips, given), "ab"):
+            np.testing.assert_array_equal(found, np.rot90(plates[name], turn))
+    stored = load_video(tmp_path, cameras("a", "b"), rotation=0)
+    np.testing.assert_array_equal(_plates(stored, None)[0], plates["a"])
+
+
+def test_masks_of_a_clip_are_read_as_masks_of_photographs_are(tmp_path):
+    """Of zeros and ones, with a turn in their EXIF block."""
+    mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    mask[10:20, 5:50] = 1
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        image = Image.fromarray(mask)
+        exif = image.getexif()
+        exif[0x0112] = 6
+        image.save(tmp_path / name / "0.png", exif=exif)
+    clips = load_video(tmp_path, cameras("a", "b", size=SIZE[::-1]))
+    np.testing.assert_array_equal(clips.clips[0].mask(0), np.rot90(mask, 3) * 255)
+    assert clips.clips[0].mask(0).dtype == np.uint8
+
+
+def test_a_clip_keeps_that_its_world_is_mirrored(tmp_path):
+    for name in "ab":
+        write_video(tmp_path / f"{name}.mp4", 3)
+    rig = mvcore.Calibration(tuple(cameras("a", "b")), "rig.json", mirrored=True)
+    clips = load_video(tmp_path, rig)
+    assert clips.calib.mirrored
+    assert clips.calib.source == "rig.json"
+    assert not load_video(tmp_path, list(rig)).calib.mirrored
+    assert with_calibration(clips, rig).calib.mirrored
+    assert not with_calibration(clips, list(rig)).calib.mirrored
+    scene = mvcore.Scene([None] * 2, rig)
+    mvcore.save_calibration(tmp_path / "cameras.json", scene)
+    assert load_video(tmp_path).calib.mirrored
+    assert with_calibration(load_video(tmp_path, list(rig)), tmp_path / "cameras.json").calib.mirrored

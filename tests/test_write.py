@@ -1,6 +1,7 @@
 """Calibrations written for other tools, with sparse points: what those tools read is what was written."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import mvcore
@@ -147,3 +148,70 @@ def test_convert_takes_points_from_the_images(tmp_path):
     run = CliRunner().invoke(app, ["convert", str(tmp_path / "set"), str(tmp_path / "colmap"), "--to", "colmap"])
     assert run.exit_code == 0, run.output
     assert len((tmp_path / "colmap" / "points3D.txt").read_text().splitlines()) > 30
+
+
+def test_names_start_at_the_folder_of_all_images(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    for place, expected in (
+        ("images/scene/images/cam{}/0001.jpg", "cam{}/0001.jpg"),  # the name of an image folder twice
+        ("photos dir/cäm {}/a b.jpg", "cäm {}/a b.jpg"),
+        ("other/{}.png", "{}.png"),
+        ("rgb/left/{}.png", "left/{}.png"),
+    ):
+        home = tmp_path / place.partition("{")[0].replace("/", "_")
+        frames = [home / place.format(n) for n in range(4)]
+        root = home / "images" / "scene" if "scene" in place else home
+        calib = mvcore.Calibration(tuple(cameras_around()), str(root / "cameras.json"))
+        mvcore.save_calibration(home / "colmap", mvcore.Scene(frames, calib), "colmap")
+        read = pycolmap.Reconstruction(str(home / "colmap"))
+        assert sorted(i.name for i in read.images.values()) == [expected.format(n) for n in range(4)]
+
+
+def test_names_with_blanks_make_a_binary_model(tmp_path, points):
+    pycolmap = pytest.importorskip("pycolmap")
+    scene = scene_of(tmp_path / "set", cameras_around(LENS))
+    for form in ("plain", "with blanks"):
+        frames = [f.rename(f.with_name(f"{form} {n}.png" if form != "plain" else f.name)) for n, f in enumerate(scene.frames)]
+        mvcore.save_calibration(tmp_path / form, replace(scene, frames=frames), "colmap", points=points)
+    plain, blanks = (pycolmap.Reconstruction(str(tmp_path / form)) for form in ("plain", "with blanks"))
+    assert {i.name for i in blanks.images.values()} == {f"with blanks {n}.png" for n in range(4)}
+    assert (tmp_path / "with blanks" / "images.bin").is_file()
+    for number, image in plain.images.items():
+        other = blanks.images[number]
+        assert [p.point3D_id for p in image.points2D] == [p.point3D_id for p in other.points2D]
+        np.testing.assert_array_equal([p.xy for p in image.points2D], [p.xy for p in other.points2D])
+        np.testing.assert_array_equal(image.camera.params, other.camera.params)
+    for number, point in plain.points3D.items():
+        other = blanks.points3D[number]
+        np.testing.assert_array_equal([*point.xyz, *point.color], [*other.xyz, *other.color])
+        assert [(e.image_id, e.point2D_idx) for e in point.track.elements] == [(e.image_id, e.point2D_idx) for e in other.track.elements]
+    read = mvcore.load(tmp_path / "with blanks", images=tmp_path / "set" / "images")
+    assert [f.name for f in read.frames] == [f"with blanks {n}.png" for n in range(4)]
+
+
+def test_our_own_file_keeps_masks_names_and_a_mirrored_world(tmp_path):
+    cameras = tuple(replace(c, name=f"cam {n}") for n, c in enumerate(cameras_around()))
+    scene = scene_of(tmp_path / "set", cameras)
+    masks = [tmp_path / "set" / "mattes of mine" / f.name for f in scene.frames]
+    masks[0].parent.mkdir()
+    for mask in masks:
+        cv2.imwrite(str(mask), np.zeros((SIZE[1], SIZE[0]), np.uint8))
+    bounds = np.array([[-1.0, -1, -0.5], [1, 1, 2]])
+    for mirrored in (False, True):
+        calib = mvcore.Calibration(cameras, mirrored=mirrored)
+        mvcore.save_calibration(tmp_path / "set" / "cameras.json", mvcore.Scene(scene.frames, calib, masks, bounds))
+        read = mvcore.load(tmp_path / "set")
+        assert read.mirrored == mirrored
+        assert list(read.masks) == masks
+        assert [c.name for c in read.calib] == [c.name for c in cameras]
+        np.testing.assert_allclose(read.bounds, bounds)
+        for a, b in zip(read.calib, cameras):
+            np.testing.assert_allclose(a.project([[0.1, 0.2, 0.3]]), b.project([[0.1, 0.2, 0.3]]), atol=1e-9)
+    *_, far = map(float, _mvsnet_range(tmp_path, mvcore.Scene(scene.frames, mvcore.Calibration(cameras, mirrored=True), None, bounds)))
+    depths = cameras[0].to_camera(np.array(np.meshgrid([-1.0, 1], [-1.0, 1], [-2.0, 0.5])).reshape(3, -1).T)[:, 2]
+    assert far == pytest.approx(depths.max())
+
+
+def _mvsnet_range(folder, scene):
+    mvcore.save_calibration(folder / "mvs", scene, "mvsnet")
+    return (folder / "mvs" / "cams" / "00000000_cam.txt").read_text().split()[-4:]

@@ -110,7 +110,7 @@ def _replaced(pattern: re.Pattern[bytes]):
 
 def _token(data: bytes, _: bytes, random: random.Random) -> bytes:
     start, _ = _span(data, random)
-    return data[:start] + random.choice(TOKENS) * random.choice((1, 1, 1, 2, 200, 20_000)) + data[start:]
+    return data[:start] + random.choice(TOKENS) * random.choice((1,) * 12 + (2, 2, 200, 200, 2000, 20_000)) + data[start:]
 
 
 def _line(data: bytes, _: bytes, random: random.Random) -> bytes:

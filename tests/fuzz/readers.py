@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mvcore
-from mvcore import _core
+from mvcore import Config, _core
 from mvcore.evaluation.metrics import load_geometry
+from mvcore.io import streams
+from mvcore.io.formats import detect
+from mvcore.io.formats.records import to_scene
 from mvcore.io.images import read_image, read_mask
 from mvcore.io.maps import read_pfm
 from mvcore.nurbs.obj import load_obj
@@ -22,33 +25,60 @@ from mvcore.viewer.page import write_page
 from . import runner, seeds
 from .mutate import mutated
 
-TEXTLIKE = (".txt", ".json", ".yml", ".yaml", ".xml", ".toml", ".csv", ".npz", ".bin", ".camera", ".npy", ".out", ".nvm", ".sfm", ".log")
+CALIBRATIONS = (".txt", ".json", ".yml", ".yaml", ".xml", ".toml", ".csv", ".npz", ".bin", ".camera", ".npy", ".out", ".nvm", ".sfm", "")
+"""Suffixes of the files of a data set that are mutated."""
+WHOLE = 8
+"""One of so many cases of a data set goes through `mvcore.load`, which asks all readers; the others through the one that reads it."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A file to mutate, and what reads it."""
+    """A file to mutate, and what reads it: in short, and as a user's call does."""
 
     name: str
     file: Path
     read: Callable[[], object]
+    whole: Callable[[], object]
 
 
 def targets(folder: Path) -> list[Target]:
     """Every file of every seed."""
     out = []
     for name, scene in seeds.scenes(folder).items():
-        for file in sorted(f for f in scene.rglob("*") if f.is_file() and f.suffix in TEXTLIKE):
-            out.append(Target(f"{name}/{file.relative_to(scene)}", file, lambda scene=scene: mvcore.load(scene)))
+        load = lambda scene=scene: mvcore.load(scene)  # noqa: E731
+        short = _reader(scene)
+        for file in sorted(f for f in scene.rglob("*") if f.is_file() and f.suffix in CALIBRATIONS):
+            out.append(Target(f"{name}/{file.relative_to(scene)}", file, short, load))
     single = seeds.files(folder / "files")
-    read = {"pfm": read_pfm, "nurbs": load_obj, "index": lambda f: write_page(f.parent)}
-    read |= dict.fromkeys(("glb", "ply", "stl", "off", "obj"), load_geometry)
-    read |= dict.fromkeys(("png", "jpg", "bmp", "tif", "webp"), lambda f: (read_image(f), read_mask(f)))
+    read = {"pfm": read_pfm, "nurbs": load_obj, "index": lambda f: write_page(f.parent), "settings": Config.from_file}
+    read |= dict.fromkeys(("glb", "ply", "binary ply", "stl", "off", "obj"), load_geometry)
+    read |= dict.fromkeys(seeds.IMAGES, lambda f: (read_image(f), read_mask(f)))
+    read |= dict.fromkeys(seeds.VIDEOS, _frames)
     store = Store(folder / "files" / "store")
     read["store"] = lambda _: store.load(seeds.KEY)
-    out += [Target(name, file, lambda name=name, file=file: read[name](file)) for name, file in single.items()]
-    out.append(Target("core obj", single["obj"], lambda: _core.read_obj(str(single["obj"]))))
-    return out
+    calls = [(name, file, lambda name=name, file=file: read[name](file)) for name, file in single.items()]
+    calls.append(("core obj", single["obj"], lambda: _core.read_obj(str(single["obj"]))))
+    return [*out, *(Target(name, file, call, call) for name, file, call in calls)]
+
+
+def _reader(scene: Path) -> Callable[[], object]:
+    """What `mvcore.load` does with a data set once it knows the format, cameras alone."""
+    name = mvcore.load(scene).format
+    reader = next(r for r in detect.READERS if r.name == name)
+
+    def read() -> object:
+        at = detect._guarded(reader, reader.find, scene)
+        if at is None:
+            return None
+        found = detect._guarded(reader, reader.read, at, *([None] if reader.lists_images else []))
+        return to_scene(found, need_images=False, given=scene)
+
+    return read
+
+
+def _frames(path: Path) -> object:
+    stream = streams.open_stream(path)
+    return [streams.video_frame(path, n) for n in sorted({0, len(stream) - 1})]
 
 
 class Fuzzer:
@@ -72,7 +102,7 @@ class Fuzzer:
         target.file.unlink(missing_ok=True)
         target.file.write_bytes(content)
         try:
-            target.read()
+            (target.read if number // len(self.targets) % WHOLE else target.whole)()
         finally:
             target.file.write_bytes(self.data[number % len(self.targets)])
 

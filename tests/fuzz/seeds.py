@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
+import av
 import cv2
 import mvcore
 import numpy as np
+import OpenEXR
+import other_tools
 import trimesh
 from conftest import rig, write_scene
 from mvcore.io.formats.colmap import rotation_to_quaternion
@@ -21,6 +25,8 @@ from PIL import Image
 COUNT = 3
 KEY = "ab" * 20
 """Of an entry of the store."""
+IMAGES = ("png", "jpg", "bmp", "tif", "webp", "deep png", "deep tif", "exr", "ppm")
+VIDEOS = ("mp4", "mkv", "avi", "mts")
 
 
 def scenes(folder: Path) -> dict[str, Path]:
@@ -29,28 +35,44 @@ def scenes(folder: Path) -> dict[str, Path]:
     images = [np.full((24, 32, 3), 40 * n, np.uint8) for n in range(COUNT)]
     out = {"native": write_scene(folder / "native", cameras, images)}
     scene = mvcore.load(out["native"])
-    for build in (
-        _colmap_text,
-        _colmap_binary,
-        _mvsnet,
-        _nerf,
-        _idr,
-        _middlebury,
-        _strecha,
-        _qualisys,
-        _easymocap,
-        _kalibr,
-        _opencv,
-        _stereo,
-    ):
-        name = build.__name__.strip("_")
+    for name, build in BUILDERS.items():
         (folder / name / "images").mkdir(parents=True)
         for n, image in enumerate(images):
             cv2.imwrite(str(folder / name / f"{n}.png"), image)
             cv2.imwrite(str(folder / name / "images" / f"{n:03d}.png"), image)
         build(folder / name, scene)
         out[name] = folder / name
+    return out | _scenes_of_tools(folder)
+
+
+def _tools() -> dict[str, Callable[[Path], object]]:
+    """What writes a data set of each of the tools in `other_tools`."""
+    poses = other_tools.views()
+    writers = {name: lambda at, write=write: write(at, poses) for name, write in other_tools.WRITERS.items()}
+    writers |= {f"ROS {model}": lambda at, model=model: other_tools.write_ros(at, model) for model in other_tools.ROS_LENSES}
+    writers |= {"KITTI": other_tools.write_kitti, "Middlebury stereo": other_tools.write_middlebury_stereo}
+    motion = lambda r, t: {"R": r, "T": t.tolist()}  # noqa: E731
+    names = (("M1", "D1", "M2", "D2"), ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"))
+    for storages, keys in ((["intrinsics.yml", "extrinsics.yml"], names[0]), (["stereo.xml"], names[1]), (["stereo.json"], names[0])):
+        writers[f"stereo {storages[0]}"] = lambda at, files=storages, keys=keys: _stereo_pair(at, poses, files, keys, motion)
+    return writers
+
+
+TOOLS = _tools()
+
+
+def _scenes_of_tools(folder: Path) -> dict[str, Path]:
+    out = {}
+    for name, write in TOOLS.items():
+        (folder / name).mkdir()
+        write(folder / name)
+        out[name] = folder / name / "office0" if name == "Replica" else folder / name
     return out
+
+
+def _stereo_pair(folder: Path, poses, files, keys, motion) -> None:
+    other_tools.storage_pair(folder, poses, files, keys, motion)
+    other_tools.pictures(folder, ["left.png", "right.png"])
 
 
 def _colmap_text(folder: Path, scene) -> None:
@@ -172,6 +194,30 @@ def _stereo(folder: Path, scene) -> None:
         (folder / f"{n}.png").rename(folder / f"{name}.png")
 
 
+def _pictures(folder: Path, out: dict[str, Path]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
+    for suffix in ("png", "jpg", "bmp", "tif", "webp", "ppm"):
+        out[suffix] = folder / f"image.{suffix}"
+        cv2.imwrite(str(out[suffix]), image)
+    for suffix in ("png", "tif"):
+        out[f"deep {suffix}"] = folder / suffix / f"deep.{suffix}"
+        out[f"deep {suffix}"].parent.mkdir()
+        cv2.imwrite(str(out[f"deep {suffix}"]), image.astype(np.uint16) * 16)
+    out["exr"] = folder / "image.exr"
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": image.astype(np.float32)}) as file:
+        file.write(str(out["exr"]))
+
+
+def _video(path: Path, codec: str) -> None:
+    with av.open(str(path), "w", format="mpegts" if path.suffix == ".mts" else None) as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        for n in range(6):
+            frame = av.VideoFrame.from_ndarray(np.full((32, 32, 3), 40 * n, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
 def files(folder: Path) -> dict[str, Path]:
     """A file a reader that takes one."""
     folder.mkdir()
@@ -182,9 +228,15 @@ def files(folder: Path) -> dict[str, Path]:
         out[suffix] = folder / f"mesh.{suffix}"
         trimesh.creation.box().export(out[suffix]) if suffix != "glb" else box.export(out[suffix])
     image = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
-    for suffix in ("png", "jpg", "bmp", "tif", "webp"):
-        out[suffix] = folder / f"image.{suffix}"
-        cv2.imwrite(str(out[suffix]), image)
+    out["binary ply"] = folder / "binary.ply"
+    out["binary ply"].write_bytes(trimesh.creation.box().export(file_type="ply"))
+    out["ply"].write_bytes(trimesh.creation.box().export(file_type="ply", encoding="ascii"))
+    _pictures(folder, out)
+    for suffix in VIDEOS:
+        out[suffix] = folder / f"clip.{suffix}"
+        _video(out[suffix], "mpeg2video" if suffix == "mts" else "mpeg4")
+    out["settings"] = folder / "settings.toml"
+    out["settings"].write_text('device = "cpu"\n[depth]\nsources = 4\nmax_angle = 40.5\n[volume]\nmax_memory = 100000000\n')
     out["pfm"] = folder / "map.pfm"
     write_pfm(out["pfm"], image[..., 0].astype(np.float32))
     out["nurbs"] = folder / "nurbs.obj"
@@ -204,3 +256,20 @@ def files(folder: Path) -> dict[str, Path]:
     index = {"format": "mvcore sequence", "version": 1, "warnings": ["v"], "instants": [instant], "rigid": rigid}
     out["index"].write_text(json.dumps(index))
     return out
+
+
+BUILDERS = {
+    "colmap_text": _colmap_text,
+    "colmap_binary": _colmap_binary,
+    "mvsnet": _mvsnet,
+    "nerf": _nerf,
+    "idr": _idr,
+    "middlebury": _middlebury,
+    "strecha": _strecha,
+    "qualisys": _qualisys,
+    "easymocap": _easymocap,
+    "kalibr": _kalibr,
+    "opencv": _opencv,
+    "stereo": _stereo,
+}
+"""The formats that came first, but for our own."""

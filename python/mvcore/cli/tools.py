@@ -100,10 +100,13 @@ def convert(
     from ..pipeline.convert import sparse_points
     from ..types import Report
 
-    format = to or ("mvcore" if output.suffix == ".json" else "colmap")
+    is_json = output.suffix.lower() == ".json"
+    format = to or ("mvcore" if is_json else "colmap")
     scene = load(path, images=False if images is None else images, allow_outside=allow_outside)
     shown().warn(scene.warnings)
-    check_writable(output, folder=format != "mvcore" and output.suffix != ".json")
+    if scene.mirrored and format != "mvcore":
+        shown().warn([f"{format} holds no mirrored world: the cameras written are those of its reflection in z"])
+    check_writable(output, folder=format != "mvcore" and not is_json)
     report = Report()
     points = None if format == "mvcore" else sparse_points(scene, report, shown().track())
     shown().warn(report.warnings)

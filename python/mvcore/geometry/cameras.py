@@ -64,7 +64,8 @@ def rotation_from(matrix: ArrayLike, name: str = "R") -> Float:
         A matrix that is off by more than `ROTATION_TOLERANCE`, or a reflection.
     """
     r = _matrix(name, matrix, (3, 3))
-    off = np.abs(r @ r.T - np.eye(3)).max()
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(r @ r.T - np.eye(3)).max()
     require(off < ROTATION_TOLERANCE, name, "a rotation (R Rᵀ = 1)", f"a deviation of {off:.3g}")
     det = np.linalg.det(r)
     require(det > 0, name, "a rotation", f"a reflection (det {det:.3g})")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InvalidInputError, require
+from ..errors import FormatError, InvalidInputError, MvcoreError, require
 from ..geometry.cameras import Calibration, Camera
 from ..types import Image
 from .clip_cameras import fitted, matched, turned
@@ -151,21 +151,22 @@ def load_video(
     >>> len(load_video({"a": frames, "b": frames}, [camera, camera]))
     3
     """
-    sources = dict(path) if isinstance(path, Mapping) else find_sources(Path(path))
-    clips = [_clip(name, source) for name, source in sources.items()]
+    if not isinstance(path, Mapping):
+        find_sources(Path(path))  # a folder without clips is named before its calibration is
     if calib is None:
         require(not isinstance(path, Mapping), "calib", "cameras for the given clips", None)
         calib = path  # type: ignore[assignment]
     if isinstance(calib, str | Path):
         calib = load(calib, images=False, allow_outside=allow_outside).calib
-    clips, cameras = _selected(clips, list(calib), only, exclude)  # type: ignore[arg-type]
+    source, mirrored = (calib.source, calib.mirrored) if isinstance(calib, Calibration) else ("", False)
+    clips, cameras = _matched(path, list(calib), only, exclude)  # type: ignore[arg-type]
     warnings: list[str] = []
-    clips = turned(matched(clips, cameras), cameras, rotation, warnings)
+    clips = turned(clips, cameras, rotation, warnings)
     warnings += [f"{c.name}: frames are interlaced: moving edges have teeth" for c in clips if _interlaced(c)]
     cameras = [fitted(clip, camera, warnings) for clip, camera in zip(clips, cameras, strict=True)]
     numbers, times = timeline(clips, offsets or {}, rates, warnings)
     index = _taken(len(numbers), start, stop, stride)
-    return Clips(tuple(clips), Calibration(tuple(cameras)), numbers[index], times[index], numbers, tuple(warnings))
+    return Clips(tuple(clips), Calibration(tuple(cameras), source, mirrored), numbers[index], times[index], numbers, tuple(warnings))
 
 
 def _taken(count: int, start: int, stop: int | None, stride: int) -> NDArray[np.int64]:
@@ -174,6 +175,20 @@ def _taken(count: int, start: int, stop: int | None, stride: int) -> NDArray[np.
     if not len(chosen):
         raise InvalidInputError(f"start, stop: expected instants of 0 .. {count}, got {start} .. {stop}")
     return chosen
+
+
+def _matched(
+    path: str | Path | Mapping[str, Source], cameras: list[Camera], only: str | None, exclude: str | None
+) -> tuple[list[Clip], list[Camera]]:
+    """The cameras and their clips, of the first place in the folder whose clips are the cameras'."""
+    reason: MvcoreError | None = None
+    for sources in [dict(path)] if isinstance(path, Mapping) else _places(Path(path)):
+        try:
+            clips, chosen = _selected([_clip(name, source) for name, source in sources.items()], cameras, only, exclude)
+            return matched(clips, chosen), chosen
+        except MvcoreError as error:
+            reason = reason or error
+    raise reason or InvalidInputError("path: expected clips, got none")
 
 
 def _selected(clips: list[Clip], cameras: list[Camera], only: str | None, exclude: str | None) -> tuple[list[Clip], list[Camera]]:
@@ -190,22 +205,39 @@ def _interlaced(clip: Clip) -> bool:
 
 
 def find_sources(folder: Path) -> dict[str, Source]:
-    """The cameras' clips below a folder, by name."""
+    """The cameras' clips below a folder, by name; of several places that may hold them the surest."""
+    found = next(_places(folder), None)
+    if found is None:
+        raise FormatError(
+            f"{folder}: expected video files or a folder of images a camera, in it or in its 'videos' or 'images'; for images of one "
+            "moment use 'mvcore reconstruct'"
+        )
+    return found
+
+
+def _places(folder: Path) -> Iterator[dict[str, Source]]:
+    """The clips of each place below a folder that holds some."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of clips")
+    reason: FormatError | None = None
     for base in (folder, folder / "videos", folder / "images"):
         if not base.is_dir():
             continue
-        videos = sorted((f for f in base.iterdir() if is_video(f)), key=natural_order)
-        if videos:
-            return _by_stem(videos)
-        folders = [f for f in base.iterdir() if f.is_dir() and f.name not in ("masks", "depth", "videos", "images") and frame_files(f)]
+        try:
+            if videos := sorted((f for f in base.iterdir() if is_video(f)), key=natural_order):
+                yield _by_stem(videos)
+        except FormatError as error:  # two files of a camera, which matters where there is no other place
+            reason = reason or error
+        folders = [f for f in base.iterdir() if f.is_dir() and f.name not in NO_CAMERAS and not f.name.startswith(".") and frame_files(f)]
         if folders:
-            return {f.name: f for f in sorted(folders, key=natural_order)}
-    raise FormatError(
-        f"{folder}: expected video files or a folder of images a camera, in it or in its 'videos' or 'images'; for images of one moment "
-        "use 'mvcore reconstruct'"
-    )
+            reason = None
+            yield {f.name: f for f in sorted(folders, key=natural_order)}
+    if reason is not None:
+        raise reason
+
+
+NO_CAMERAS = ("masks", "depth", "videos", "images")
+"""Folders that are no camera's."""
 
 
 def _by_stem(videos: Sequence[Path]) -> dict[str, Source]:

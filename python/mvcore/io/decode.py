@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from PIL import TiffImagePlugin
 
-from ..errors import FormatError
+from ..errors import FormatError, MvcoreError
 from .pairing import natural_order
 
 HEIC = (".heic", ".heif")
@@ -207,29 +209,39 @@ def _pillow(path: Path) -> NDArray[Any]:
         raise FormatError(f"{path}: cannot be decoded: {' '.join(str(error).split()) or type(error).__name__}") from None
 
 
-def _exr_file(path: Path, header_only: bool) -> Any:
-    import OpenEXR
-
+@contextmanager
+def _reading_exr(path: Path) -> Iterator[None]:
+    """OpenEXR's errors, some of which come only when parts and channels are asked for, as ours."""
     try:
-        return OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+        yield
+    except (MvcoreError, MemoryError):
+        raise
     except Exception as error:
         raise FormatError(f"{path}: not an EXR image that can be read: {' '.join(str(error).split())}") from None
 
 
 def _exr_header(path: Path) -> Header:
-    file = _exr_file(path, header_only=True)
-    low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
-    width, height = (int(v) for v in high - low + 1)
+    import OpenEXR
+
+    with _reading_exr(path):
+        file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
+        low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
+        width, height = (int(v) for v in high - low + 1)
+        names = {c.name for c in file.header()["channels"]}
     _check_size(path, width, height)
-    return Header(width, height, 1, "A" in {c.name for c in file.header()["channels"]})
+    return Header(width, height, 1, "A" in names)
 
 
 def _exr(path: Path) -> NDArray[Any]:
-    with _exr_file(path, header_only=False) as file:
+    import OpenEXR
+
+    with _reading_exr(path), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.asarray(c.pixels, np.float32) for name, c in file.channels().items()}
-    if {"R", "G", "B"} <= set(channels):
-        return np.stack([channels[n] for n in ("R", "G", "B", "A") if n in channels], -1)
     grey = channels.get("Y", next(iter(channels.values()), None) if len(channels) == 1 else None)
-    if grey is None:
-        raise FormatError(f"{path}: expected channels R, G, B or Y, got {', '.join(channels)}")
-    return grey
+    colour = [channels[n] for n in ("R", "G", "B", "A") if n in channels]
+    chosen = colour if {"R", "G", "B"} <= set(channels) else [] if grey is None else [grey]
+    if not chosen:
+        raise FormatError(f"{path}: expected channels R, G, B or Y, got {', '.join(channels) or 'none'}")
+    if any(c.ndim != 2 or c.shape != chosen[0].shape for c in chosen):
+        raise FormatError(f"{path}: expected channels of one size, got {', '.join(str(c.shape) for c in chosen)}")
+    return np.stack(chosen, -1) if len(chosen) > 1 else chosen[0]

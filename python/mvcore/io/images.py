@@ -15,6 +15,7 @@ from ..geometry.cameras import Camera, same_shape
 from ..types import Frame, Image
 from .decode import decode, eight_bits, read_header, turn
 from .formats.places import IMAGE_SUFFIXES, images_below
+from .limits import MOST_SIDE
 from .pairing import pair_by_name
 
 LABELS = 64
@@ -25,6 +26,10 @@ BETWEEN = 0.05
 """Share of a mask's non-zero pixels that are flat and between dark and bright from which it is a label image, not a soft mask."""
 NOISE = 32
 """Grey levels that JPEG adds to a black mask, of 255."""
+PART = 8192
+"""Pixels a side of the parts in which larger images than OpenCV takes are undistorted."""
+MARGIN = 4
+"""Pixels around a part that its interpolation reads."""
 INVERTED = 0.15
 """By how much the border must exceed the inside, as shares of target pixels, for a mask to look inverted."""
 
@@ -114,7 +119,9 @@ def find_pictures(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     found = {}
     for name in names:
         inner = sorted((folder / name).iterdir()) if (folder / name).is_dir() else []
-        files = [f for f in [*sorted(folder.glob(f"{name}.*")), *inner] if f.suffix.lower() in IMAGE_SUFFIXES]
+        files = [
+            f for f in [*sorted(folder.glob(f"{name}.*")), *inner] if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")
+        ]
         if not files:
             raise FormatError(f"{folder}: no picture of camera {name}")
         found[name] = files[0]
@@ -187,12 +194,12 @@ def mask_warnings(masks: Sequence[NDArray[np.uint8] | None]) -> list[str]:
     present = [(n, m > 127) for n, m in enumerate(masks) if m is not None and not (m > 127).all()]
     if len(present) < len(masks):
         missing = sorted(set(range(len(masks))) - {n for n, _ in present})
-        messages.append(f"{len(missing)} of {len(masks)} views have no mask, or one that is all target ({_some(missing)})")
+        messages.append(f"masks: {len(missing)} of {len(masks)} views have none, or one that is all target ({_some(missing)})")
     if empty := [n for n, m in present if not m.any()]:
-        messages.append(f"{len(empty)} of {len(masks)} masks are empty ({_some(empty)})")
+        messages.append(f"masks: {len(empty)} of {len(masks)} are empty ({_some(empty)})")
     excess = [_border(m) - float(m.mean()) for _, m in present if m.any()]
     if excess and np.median(excess) > INVERTED:
-        messages.append("masks look inverted: they fill the images' borders more than their inside; the target must be bright")
+        messages.append("masks: they look inverted: they fill the images' borders more than their inside; the target must be bright")
     return messages
 
 
@@ -219,15 +226,50 @@ def undistort(image: NDArray[np.uint8], camera: Camera, nearest: bool = False) -
     """The image that a pinhole with the same K would have taken (OpenCV); masks with ``nearest``."""
     if not camera.distorted:
         return image
+    method = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
+    x, y = _distorted_maps(camera)
+    if max(image.shape[:2]) <= MOST_SIDE and max(x.shape) <= MOST_SIDE:
+        return cv2.remap(image, x, y, method, borderMode=cv2.BORDER_CONSTANT)
+    out = np.zeros((*x.shape, *image.shape[2:]), image.dtype)
+    for top in range(0, x.shape[0], PART):
+        for left in range(0, x.shape[1], PART):
+            part = np.s_[top : top + PART, left : left + PART]
+            out[part] = _remapped(image, x[part], y[part], method)
+    return out
+
+
+def _distorted_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where the lens shows what a pinhole shows at each pixel."""
     size = (camera.width, camera.height)
     build = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
     k = camera.K
-    if k[0, 1]:  # OpenCV leaves skew out of the distorted side
-        x, y = build(np.eye(3), camera.distortion, np.eye(3), k, size, cv2.CV_32FC1)
-        x, y = (k[0, 0] * x + k[0, 1] * y + k[0, 2]).astype(np.float32), (k[1, 1] * y + k[1, 2]).astype(np.float32)
-    else:
-        x, y = build(k, camera.distortion, np.eye(3), k, size, cv2.CV_32FC1)
-    return cv2.remap(image, x, y, cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    if not k[0, 1]:
+        return build(k, camera.distortion, np.eye(3), k, size, cv2.CV_32FC1)
+    # OpenCV leaves skew out of the distorted side
+    x, y = build(np.eye(3), camera.distortion, np.eye(3), k, size, cv2.CV_32FC1)
+    return (k[0, 0] * x + k[0, 1] * y + k[0, 2]).astype(np.float32), (k[1, 1] * y + k[1, 2]).astype(np.float32)
+
+
+def _remapped(image: NDArray[np.uint8], x: NDArray[np.float32], y: NDArray[np.float32], method: int) -> NDArray[np.uint8]:
+    """A part of `undistort`, from the part of the image that it shows: cv2.remap takes sides of at most `MOST_SIDE` pixels.
+
+    Raises
+    ------
+    InvalidInputError
+        A lens that shows more than that in the part.
+    """
+    height, width = image.shape[:2]
+    near = (x > -MARGIN) & (x < width + MARGIN) & (y > -MARGIN) & (y < height + MARGIN)
+    if not near.any():
+        return np.zeros((*x.shape, *image.shape[2:]), image.dtype)
+    left, top = (max(0, int(v[near].min()) - MARGIN) for v in (x, y))
+    right, bottom = int(x[near].max()) + MARGIN + 1, int(y[near].max()) + MARGIN + 1
+    source = np.ascontiguousarray(image[top:bottom, left:right])
+    require(
+        max(source.shape[:2]) <= MOST_SIDE, "image", f"parts of at most {MOST_SIDE} pixels a side", f"{source.shape[1]} x {source.shape[0]}"
+    )
+    x, y = np.where(near, x - left, -2 * MARGIN), np.where(near, y - top, -2 * MARGIN)
+    return cv2.remap(source, x.astype(np.float32), y.astype(np.float32), method, borderMode=cv2.BORDER_CONSTANT)
 
 
 def reduce(image: NDArray[np.uint8], camera: Camera, limit: int, nearest: bool = False) -> tuple[NDArray[np.uint8], Camera]:

@@ -33,7 +33,7 @@ MOST_DEPTH = 64
 MOST_INTEGER = 18
 """Digits, with a sign, of a whole number that stays one."""
 MOST_SIDE = (1 << 15) - 2
-"""Pixels along a side of an image: OpenCV undistorts no larger ones."""
+"""Pixels along a side of an image that OpenCV remaps; and of a camera in files of rigs, whose sensors are smaller."""
 MOST_ARRAYS = 1 << 30
 """Bytes of the arrays of an archive that are read, by default."""
 NPY_MAGIC = b"\x93NUMPY"

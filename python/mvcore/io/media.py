@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image as PillowImage
+from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..types import Image
+from .decode import read_header
 from .formats.records import IMAGE_SUFFIXES, image_size
-from .images import read_image
+from .images import read_image, read_mask
 from .pairing import natural_order
 from .streams import open_stream, video_frame
 
@@ -23,7 +24,6 @@ VIDEO_SUFFIXES = (
 """Compared without case."""
 PLATES = ("background", "clean", "plate", "empty")
 """Names, without their suffix, of an image without the target among a camera's frames."""
-EXIF_ORIENTATION = 0x0112
 EXIF_TURNS = {3: 2, 6: 3, 8: 1}
 """Quarter turns, counter-clockwise, that show an image of that EXIF orientation upright."""
 
@@ -48,11 +48,16 @@ class Clip:
     def frame(self, number: int) -> Image:
         """Frame ``number``, (h, w, 3) uint8 RGB."""
         if isinstance(self.source, Path):
-            image = video_frame(self.source, number)
-        elif isinstance(self.source, tuple):
-            image = read_image(self.source[number])
-        else:
-            image = self.source[number]
+            return self._upright(video_frame(self.source, number), number)
+        return self._upright(read_image(self.source[number]) if isinstance(self.source, tuple) else self.source[number], number)
+
+    def mask(self, number: int) -> NDArray[np.uint8]:
+        """Frame ``number`` of a clip of masks, (h, w) uint8 of 0 and 255: files as `read_mask` takes them, else where it is bright."""
+        if isinstance(self.source, tuple):
+            return self._upright(read_mask(self.source[number]), number)
+        return np.where(self.frame(number).max(2) > 127, 255, 0).astype(np.uint8)
+
+    def _upright(self, image: NDArray[np.uint8], number: int) -> NDArray[np.uint8]:
         if self.turn:
             image = np.ascontiguousarray(np.rot90(image, self.turn))
         if image.shape[:2] != (self.height, self.width):
@@ -63,28 +68,28 @@ class Clip:
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file's suffix is a video's."""
-    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+    """Whether a file's suffix is a video's; hidden files, which file managers leave, are none."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def frame_files(folder: Path) -> list[Path]:
     """A folder's images in natural order, without a clean plate."""
-    files = [f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and f.stem.lower() not in PLATES]
+    files = [f for f in folder.iterdir() if _is_image(f) and f.stem.lower() not in PLATES]
     return sorted(files, key=natural_order)
 
 
 def plate_in(folder: Path) -> Path | None:
     """A folder's clean plate."""
-    return next((f for f in sorted(folder.iterdir()) if f.stem.lower() in PLATES and f.suffix.lower() in IMAGE_SUFFIXES), None)
+    return next((f for f in sorted(folder.iterdir()) if f.stem.lower() in PLATES and _is_image(f)), None)
 
 
 def image_turn(path: Path) -> int:
     """Quarter turns, counter-clockwise, that an image's EXIF block asks for; 0 without one."""
-    with PillowImage.open(path) as image:
-        try:
-            return EXIF_TURNS.get(image.getexif().get(EXIF_ORIENTATION, 1), 0)
-        except Exception:
-            return 0  # a broken EXIF block says nothing about the pixels
+    return EXIF_TURNS.get(read_header(path).orientation, 0)
 
 
 def media_size(folder: Path, name: str) -> tuple[int, int]:

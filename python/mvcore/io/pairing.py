@@ -28,9 +28,9 @@ def pair_by_name(
 ) -> list[Path | None]:
     """The file that belongs to each name.
 
-    The strictest of these comparisons that pairs the most decides, for all names together: equal names; without
-    suffix; without suffix and case; the numbers in the name (``mask_2`` with ``v02``). Folders count where names are
-    equal without them. If nothing pairs and there are as many files as names, both are taken in natural order.
+    The strictest of these comparisons that pairs the most decides, for all names together: equal names; without suffix; without
+    suffix and case; of masks without words such as ``_mask``; the numbers in the name (``mask_2`` with ``v02``). Folders count where
+    names are equal without them. If nothing pairs and there are as many files as names, both are taken in natural order.
 
     Parameters
     ----------
@@ -60,7 +60,8 @@ def pair_by_name(
     files = sorted(candidates, key=lambda p: (natural_order(p.parent), natural_order(p)))
     if not wanted or not files:
         return _whole(wanted, files, [None] * len(wanted), what, partial)
-    best = _best(wanted, files, what, _KEYS[:-1] if exact else _KEYS)
+    keys = (*_KEYS[:-1], *([_bare] if what == "mask" else []), *([] if exact else _KEYS[-1:]))
+    best = _best(wanted, files, what, keys)
     if _paired(best):
         return _whole(wanted, files, best, what, partial)
     if in_order and not exact and len(files) == len(wanted):
@@ -126,7 +127,7 @@ def _full(path: PurePath, key: Key, folders: int) -> tuple[object, ...]:
 
 
 def _closest(name: PurePath, files: Sequence[Path]) -> list[Path]:
-    """The files that share the most folders with a name."""
+    """The files that share the most folders with a name; of those the ones in the fewest folders (not ``old/a.png`` beside ``a.png``)."""
     folders = [p.casefold() for p in name.parent.parts]
 
     def shared(file: Path) -> int:
@@ -137,7 +138,9 @@ def _closest(name: PurePath, files: Sequence[Path]) -> list[Path]:
         return count
 
     most = max(map(shared, files))
-    return [f for f in files if shared(f) == most]
+    closest = [f for f in files if shared(f) == most]
+    least = min(len(f.parts) for f in closest)
+    return [f for f in closest if len(f.parts) == least]
 
 
 def _stem(path: PurePath) -> str:
@@ -150,6 +153,14 @@ def _stem(path: PurePath) -> str:
 
 def _numbers(path: PurePath) -> tuple[int, ...]:
     return tuple(int(d) for d in re.findall(r"\d+", _stem(path)))
+
+
+MASK_WORDS = re.compile(r"(?:^|[-_. ])(?:masks?|mattes?|alpha|silhouettes?|sil|seg|segmentation|labels?|fg|foreground)(?=$|[-_. ])")
+
+
+def _bare(path: PurePath) -> str:
+    """The name without a word for what a mask is: ``left_mask`` and ``mask-left`` are ``left``."""
+    return MASK_WORDS.sub("", _stem(path).casefold()).strip("-_. ")
 
 
 _KEYS: tuple[Key, ...] = (lambda p: p.name, _stem, lambda p: _stem(p).casefold(), _numbers)

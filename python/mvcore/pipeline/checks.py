@@ -120,8 +120,10 @@ def check_frames(frames: Sequence[Frame], cameras: Sequence[Camera], notes: Find
             notes.error(view_name(camera, n), error)
 
 
-def check_masks(masks: Sequence[Frame | None] | str | Path, frames: Sequence[Frame], cameras: Sequence[Camera], notes: Findings) -> None:
-    """One mask a frame, of its shape; empty and inverted ones."""
+def check_masks(
+    masks: Sequence[Frame | None] | str | Path, frames: Sequence[Frame], cameras: Sequence[Camera], notes: Findings, decode: bool = True
+) -> None:
+    """One mask a frame, of its shape; with ``decode`` empty and inverted ones."""
     try:
         each = find_masks(masks, frames) if isinstance(masks, str | Path) else list(masks)
         require(len(each) == len(cameras), "masks", f"{len(cameras)}, one a frame", len(each))
@@ -136,11 +138,11 @@ def check_masks(masks: Sequence[Frame | None] | str | Path, frames: Sequence[Fra
                 size, want = (header.width, header.height), (cameras[n].width, cameras[n].height)
                 fits = same_shape(size, want) or header.turned == want
                 require(fits, f"masks[{n}]", f"{want[0]} x {want[1]} pixels as its camera", f"{size[0]} x {size[1]}")
-            looked.append(None if each[n] is None else load_mask(each[n], cameras[n], n))
+            if decode:
+                looked.append(None if each[n] is None else load_mask(each[n], cameras[n], n))
         except (MvcoreError, OSError) as error:
             notes.error(view_name(cameras[n], n), error)
-    for message in mask_warnings(looked):
-        notes.warn("masks", message)
+    notes.warn_all(mask_warnings(looked))
     if looked and all(m is not None and not m.any() for m in looked):
         notes.error("masks", "all are empty: expected bright pixels where the target is")
 
@@ -174,18 +176,17 @@ def check_bounds(bounds: ArrayLike | None, cameras: Sequence[Camera], notes: Fin
         return
     if box is None:
         return
-    corners = np.stack(np.meshgrid(*[np.linspace(*side, 5) for side in box.T], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
     if len(cameras) and not any(_sees(c, corners) for c in cameras):
         notes.error("bounds", f"no camera sees the box {box.tolist()}: expected the world's units and axes")
 
 
-def _sees(camera: Camera, points: NDArray[np.float64]) -> bool:
-    local = camera.to_camera(points)
+def _sees(camera: Camera, corners: NDArray[np.float64]) -> bool:
+    """Whether a camera may see a box: no side of its view has all corners outside. Sure where it says no."""
+    local = camera.to_camera(corners)
     x = local @ camera.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = x[:, 0] / x[:, 2], x[:, 1] / x[:, 2]
-        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    return bool(inside.any())
+    inside = (local[:, 2], x[:, 0], camera.width * x[:, 2] - x[:, 0], x[:, 1], camera.height * x[:, 2] - x[:, 1])
+    return all(bool((side > 0).any()) for side in inside)
 
 
 def check_places(outputs: Sequence[str | Path], folders: Sequence[str | Path], notes: Findings) -> None:

@@ -110,6 +110,8 @@ def preflight(
     workdir: str | Path | None = None,
     max_memory: int | None = None,
     moments: int = 1,
+    remote: bool = False,
+    decode_masks: bool = True,
 ) -> Preflight:
     """Check what `reconstruct` would be called with; nothing is decoded but masks, nothing is written that stays.
 
@@ -120,6 +122,8 @@ def preflight(
     workdir : where results are kept.
     max_memory : bytes that the run may take.
     moments : of a clip, each of which is a reconstruction.
+    remote : the work runs elsewhere: this machine's device and memory do not matter.
+    decode_masks : False looks at the headers of masks alone, as for images.
 
     Returns
     -------
@@ -133,18 +137,21 @@ def preflight(
     if frames is not None:
         check_frames(frames, cameras, notes)
         if masks is not None:
-            check_masks(masks, frames, cameras, notes)
+            check_masks(masks, frames, cameras, notes, decode_masks)
     # A mirrored calibration's cameras are those of the reflected world, the caller's box is not.
     check_bounds(bounds, [] if getattr(calib, "mirrored", False) else cameras, notes)
     check_places(outputs, [*folders, *([workdir] if workdir is not None else [])], notes)
-    check_device(settings, notes)
+    if not remote:
+        check_device(settings, notes)
     check_installation(notes)
     outlook = _outlook(cameras, settings, moments, max_memory) if len(cameras) >= 2 else None
     if outlook is not None:
+        _check_sources(outlook, notes)
         try:
             memory_settings(settings, max_memory, outlook.width * outlook.height)
         except InvalidInputError as error:
             notes.error("max_memory", error)
+    if outlook is not None and not remote:
         _check_memory(outlook, max_memory, notes)
     return Preflight(tuple(notes.items), outlook)
 
@@ -154,7 +161,7 @@ def preflight_clips(
 ) -> Preflight:
     """The same of clips: their first and last frames are decoded, so that a missing one shows now.
 
-    ``arguments`` are the others of `preflight`: outputs, folders, workdir, max_memory.
+    ``arguments`` are the others of `preflight`: outputs, folders, workdir, max_memory, remote.
     """
     notes = Findings()
     notes.warn_all(clips.warnings)
@@ -282,5 +289,8 @@ def _check_memory(outlook: Outlook, max_memory: int | None, notes: Findings) -> 
     if max_memory is None and free is not None and outlook.memory > free:
         text = f"about {outlook.memory / 2**30:.1f} GiB are needed, {free / 2**30:.1f} GiB are free"
         notes.warn("memory", f"{text}: a smaller max_image_size, a max_memory or fewer views help")
+
+
+def _check_sources(outlook: Outlook, notes: Findings) -> None:
     if not any(outlook.sources):
         notes.warn("calib", "by the poses alone no two views see the same surface from a useful angle")

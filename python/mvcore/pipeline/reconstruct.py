@@ -21,6 +21,7 @@ from ..types import Bounds, Frame, SparsePoints, Track, no_track
 from .checks import as_box
 from .cluster import Cluster
 from .graph import FrameTasks, Inputs, Run, Views, cropped, frame_tasks, located, overview, planned, reduced_cameras, run_frame, surveyed
+from .preflight import preflight
 from .report import assembled
 from .result import Reconstruction
 from .session import Workdir, memory_settings, open_session, stored_depths
@@ -83,17 +84,22 @@ def reconstruct(
     """
     settings = config if isinstance(config, Config) else Config.from_dict(config or {})
     request = _request(frames, calib, masks, bounds)
+    remote = executor is not None or scheduler is not None
+    before = _checked(request, settings, workdir=workdir, max_memory=max_memory, remote=remote)
     limit = settings.depth.max_image_size
     pixels = max(int(c.width * c.height * min(1.0, limit / max(c.width, c.height)) ** 2) for c in request.calib)
     settings, budget, threads = memory_settings(settings, max_memory, pixels)
     with open_session(workdir, executor, scheduler, budget, threads) as (place, runner):
-        return _reconstructed(Run(runner, settings, track or no_track), request, place)
+        return _reconstructed(Run(runner, settings, track or no_track), request, place, before)
 
 
 @dataclass(frozen=True)
 class _Request:
-    """What a caller asks for, checked; inputs and bounds in the local frame."""
+    """What a caller asks for, checked: as it was handed over, and inputs and bounds in the local frame."""
 
+    frames: Sequence[Frame]
+    masks: Sequence[Frame | None] | None
+    box: Bounds | None
     inputs: Inputs
     calib: Calibration
     bounds: Bounds | None
@@ -117,10 +123,18 @@ def _request(frames: Any, calib: Any, masks: Any, bounds: ArrayLike | None) -> _
     frame = LocalFrame.of(calib)
     cameras = frame.cameras(list(calib))
     inputs = Inputs(photographs(frames, cameras), None if masks is None else mask_sources(masks, cameras), cameras)
-    return _Request(inputs, calib, None if box is None else frame.box_inwards(box), frame)
+    return _Request(frames, masks, box, inputs, calib, None if box is None else frame.box_inwards(box), frame)
 
 
-def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruction:
+def _checked(request: _Request, settings: Config, **arguments: Any) -> Findings:
+    """What `preflight` notices before any work; masks are decoded, and looked at, where their task runs."""
+    masks = None if request.masks is None else list(request.masks)
+    found = preflight(request.frames, request.calib, masks, request.box, settings, decode_masks=False, **arguments)
+    found.require_good()
+    return Findings(warnings=found.warnings)
+
+
+def _reconstructed(run: Run, request: _Request, workdir: Workdir, before: Findings) -> Reconstruction:
     config, inputs, bounds = run.config, request.inputs, request.bounds
     whole, cameras = overview(inputs, config), reduced_cameras(inputs.cameras, config.depth.max_image_size)
     run.all(whole, "images")
@@ -128,7 +142,7 @@ def _reconstructed(run: Run, request: _Request, workdir: Workdir) -> Reconstruct
     run.all([surveying], "sparse points")
     survey: Survey = run.value(surveying)
     views, points, box, target = Views(whole, cameras), survey.points, survey.box, None
-    findings = [survey.findings]
+    findings = [before, survey.findings]
     if inputs.masks is not None:
         target, _ = located(whole, cameras, survey.box, bounds, None, config)
         where = run.value(target)

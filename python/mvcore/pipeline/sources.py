@@ -82,8 +82,8 @@ class ClipFrame:
         return np.ascontiguousarray(self.clip.frame(self.number))
 
     def mask(self) -> NDArray[np.uint8]:
-        """(h, w) uint8 of 0 and 255: where the frame is bright."""
-        return np.where(self.image().max(2) > 127, 255, 0).astype(np.uint8)
+        """(h, w) uint8 of 0 and 255, as it decodes."""
+        return np.ascontiguousarray(self.clip.mask(self.number))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,10 @@ from ..geometry.cameras import Calibration, Camera
 from ..geometry.local_frame import LocalFrame
 from ..io.clips import Clips, Source, load_video
 from ..io.images import find_pictures, read_image, undistort
+from ..io.media import Clip, image_turn
 from ..pipeline.checks import as_box
 from ..pipeline.cluster import Cluster
+from ..pipeline.preflight import preflight_clips
 from ..pipeline.result import Reconstruction
 from ..types import Image, Track, no_track
 from .run import ClipRun, Job
@@ -113,8 +115,11 @@ def reconstruct_video(
     job = _job(clips, calib, masks, background, regions, bounds, settings)
     require(target in ("free", "rigid"), "target", "free or rigid", repr(target))
     require(target == "free" or not job.whole, "background", "a target for target='rigid'", "False: the whole scene")
+    remote = executor is not None or scheduler is not None
+    before = preflight_clips(job.clips, bounds, settings, workdir=workdir, max_memory=max_memory, remote=remote)
+    before.require_good()
     names = [c.name for c in job.clips.clips]
-    run = VideoReconstruction(job.clips.times, names, list(job.clips.warnings), iter(()))
+    run = VideoReconstruction(job.clips.times, names, before.warnings, iter(()))
     clip_run = ClipRun(job, run, target == "rigid", executor, scheduler, workdir, max_memory, track or no_track)
     run._instants = clip_run.frames()
     return run
@@ -144,12 +149,13 @@ def with_calibration(clips: Clips, calib: Calibration | Sequence[Camera] | str |
     """The same clips with other cameras."""
     from ..io import load
 
-    cameras = load(calib, images=False).calib if isinstance(calib, str | Path) else list(calib)
+    cameras = load(calib, images=False).calib if isinstance(calib, str | Path) else calib
     require(len(cameras) == len(clips.clips), "calib", f"{len(clips.clips)} cameras, one a clip", len(cameras))
     for clip, camera in zip(clips.clips, cameras, strict=True):
         same = (clip.width, clip.height) == (camera.width, camera.height)
         require(same, f"calib of {clip.name}", f"{clip.width} x {clip.height} pixels", f"{camera.width} x {camera.height}")
-    return replace(clips, calib=Calibration(tuple(cameras)))
+    mirrored = isinstance(cameras, Calibration) and cameras.mirrored
+    return replace(clips, calib=Calibration(tuple(cameras), mirrored=mirrored))
 
 
 def _mask_clips(masks: str | Path | Mapping[str, Source], clips: Clips) -> Clips:
@@ -169,12 +175,20 @@ def _three_channels(source: Any) -> Any:
     return np.broadcast_to(bright[..., None], (*bright.shape, 3))
 
 
-def _picture(value: Any, camera: Camera, label: str) -> Image:
-    image = read_image(value) if isinstance(value, str | Path) else np.asarray(value)
+def _picture(value: Any, clip: Clip, camera: Camera, label: str) -> Image:
+    image = _turned(value, clip) if isinstance(value, str | Path) else np.asarray(value)
     if image.ndim == 2:
         image = np.repeat(image.astype(np.uint8)[..., None], 3, 2)
     require(image.shape == (camera.height, camera.width, 3), label, f"{camera.width} x {camera.height} pixels", image.shape)
     return undistort(np.ascontiguousarray(image, np.uint8), camera)
+
+
+def _turned(path: str | Path, clip: Clip) -> Image:
+    """A picture of a clip's camera at the size of its frames: turned as they are if it lies beside them, else as its EXIF says."""
+    image, own = read_image(path), image_turn(Path(path))
+    turns = (clip.turn, own, 0) if clip.plate == path else (own, 0, clip.turn)
+    shapes = {t: (image.shape[:2], image.shape[1::-1])[t % 2] for t in turns}
+    return np.ascontiguousarray(np.rot90(image, next((t for t in turns if shapes[t] == (clip.height, clip.width)), 0)))
 
 
 def _by_camera(mapping: Mapping[str, Any], clips: Clips, label: str) -> list[Any]:
@@ -189,12 +203,12 @@ def _plates(clips: Clips, background: Any) -> list[Image | None]:
         background = find_pictures(background, [c.name for c in clips.clips])
     given = [c.plate for c in clips.clips] if not isinstance(background, Mapping) else _by_camera(background, clips, "background")
     pictures = zip(given, clips.clips, clips.calib, strict=True)
-    return [None if g is None else _picture(g, camera, f"background of {clip.name}") for g, clip, camera in pictures]
+    return [None if g is None else _picture(g, clip, camera, f"background of {clip.name}") for g, clip, camera in pictures]
 
 
 def _regions(regions: Mapping[str, Any], clips: Clips) -> list[NDArray[np.uint8] | None]:
     given = zip(_by_camera(regions, clips, "regions"), clips.clips, clips.calib, strict=True)
-    return [None if r is None else _picture(r, camera, f"region of {clip.name}").max(2) for r, clip, camera in given]
+    return [None if r is None else _picture(r, clip, camera, f"region of {clip.name}").max(2) for r, clip, camera in given]
 
 
 __all__ = ["VideoReconstruction", "reconstruct_video"]

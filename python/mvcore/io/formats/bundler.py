@@ -35,7 +35,7 @@ def find(path: Path) -> Path | None:
         return path if FIRST.match(head(path)) else None
     for folder in (path, path / "bundle"):
         files = [f for f in files_in(folder, ".out") if FIRST.match(head(f))]
-        named = [f for f in files if f.name in ("bundle.out", "bundle.rd.out")]
+        named = [f for f in files if f.name.lower() in ("bundle.out", "bundle.rd.out")]
         if len(named or files) == 1 or named:
             return (named or files)[0]
     return None
@@ -83,7 +83,7 @@ def _names(path: Path, count: int, images: Path | None) -> tuple[list[str], list
     beside = [path.with_name(path.name + ".list.txt"), path.with_name(path.stem + ".list.txt")]
     for folder in (path.parent, path.parent.parent):
         beside += [folder / n for n in ("list.txt", "imagelist.txt", "image_list.txt", "list_focal.txt", "pictures.txt")]
-        beside += sorted(folder.glob("*list*.txt"))
+        beside += [f for f in files_in(folder, ".txt") if "list" in f.name.lower()]
     for file in beside:
         if file.is_file():
             lines = [LIST_LINE.match(line.strip())[1] for line in read_text(file).splitlines() if line.strip()]  # type: ignore[index]

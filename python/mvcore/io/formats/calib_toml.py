@@ -26,7 +26,7 @@ def find(path: Path) -> Path | None:
         return path if path.suffix.lower() == ".toml" else None
     for folder in (path, path / "calibration"):
         files = [f for f in files_in(folder, ".toml") if "matrix" in head(f)]
-        named = [f for f in files if "calib" in f.name.lower() or f.name == "camera_array.toml"]
+        named = [f for f in files if "calib" in f.name.lower() or f.name.lower() == "camera_array.toml"]
         if len(named or files) == 1:
             return (named or files)[0]
     return None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...errors import FormatError
 from ..pairing import natural_order
-from .places import dataset_root, places
+from .places import dataset_root, named, places
 from .records import Found, Lines, Record
 
 MODELS = {
@@ -65,7 +65,7 @@ Intrinsics = tuple[str, int, int, list[float]]
 def find(path: Path) -> Path | None:
     """The folder of a model at a path or in its ``sparse`` folders; of several the one with the most images."""
     if path.is_file():
-        return path.parent if path.name in ("cameras.txt", "cameras.bin", "images.txt", "images.bin") else None
+        return path.parent if path.name.lower() in ("cameras.txt", "cameras.bin", "images.txt", "images.bin") else None
     return max(models_in(path), key=lambda f: (image_count(f), -len(f.parts)), default=None)
 
 
@@ -87,36 +87,51 @@ def _numbered(folder: Path) -> list[Path]:
 
 
 def _is_model(folder: Path) -> bool:
-    return any((folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file() for s in (".bin", ".txt"))
+    return _files(folder) is not None
 
 
-def _is_binary(folder: Path) -> bool:
-    return (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+def _files(folder: Path) -> tuple[Path, Path] | None:
+    """The files of a model's cameras and images, binary ones first; None where it lacks one."""
+    for suffix in (".bin", ".txt"):
+        cameras, images = named(folder, f"cameras{suffix}"), named(folder, f"images{suffix}")
+        if cameras is not None and images is not None:
+            return cameras, images
+    return None
+
+
+def _is_binary(file: Path) -> bool:
+    return file.suffix.lower() == ".bin"
 
 
 def image_count(folder: Path) -> int:
     """Number of a model's images, at a glance; a file that does not say is read in full later, with its errors."""
-    if _is_binary(folder):
-        with (folder / "images.bin").open("rb") as stream:
+    files = _files(folder)
+    if files is None:
+        return 0
+    if _is_binary(files[1]):
+        with files[1].open("rb") as stream:
             data = stream.read(8)
         return int.from_bytes(data, "little") if len(data) == 8 else 0
     try:
-        return len(_images_text(folder / "images.txt"))
+        return len(_images_text(files[1]))
     except FormatError:
         return 0
 
 
 def read(folder: Path) -> Found:
     """The views of a model, sorted by image name."""
-    if _is_binary(folder):
-        cameras, images = _cameras_binary(folder / "cameras.bin"), _images_binary(folder / "images.bin")
+    files = _files(folder)
+    if files is None:
+        raise FormatError(f"{folder}: expected cameras and images of one model, cameras.bin and images.bin or cameras.txt and images.txt")
+    if _is_binary(files[0]):
+        cameras, images = _cameras_binary(files[0]), _images_binary(files[1])
     else:
-        cameras, images = _cameras_text(folder / "cameras.txt"), _images_text(folder / "images.txt")
+        cameras, images = _cameras_text(files[0]), _images_text(files[1])
     root = dataset_root(folder)
     base = next((f for level in places(folder).levels if (f := level / "images").is_dir()), root / "images")
     records = []
     for name, quaternion, t, camera, line in sorted(images, key=lambda i: i[0]):
-        where = f"{folder}/images.txt:{line}" if line else f"{folder}/images.bin"
+        where = f"{files[1]}:{line}" if line else str(files[1])
         if camera not in cameras:
             raise FormatError(f"{where}: image {name!r} names camera {camera}, which does not exist")
         if not np.linalg.norm(quaternion) > 0:

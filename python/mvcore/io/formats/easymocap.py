@@ -10,9 +10,9 @@ from typing import Any
 
 from ...errors import FormatError
 from ..media import media_size
-from .camera_folders import camera_image, plain_name
 from .filestorage import read_filestorage
 from .opencv import rotation_of, storage_distortion, storage_matrix, storage_size
+from .places import named
 from .records import Found, Record
 
 INTRINSIC, EXTRINSIC = "intri.yml", "extri.yml"
@@ -21,17 +21,23 @@ INTRINSIC, EXTRINSIC = "intri.yml", "extri.yml"
 def find(path: Path) -> Path | None:
     """The folder that holds both files, or either file."""
     folder = path if path.is_dir() else path.parent
-    named = path.is_dir() or path.name in (INTRINSIC, EXTRINSIC)
-    return folder if named and all((folder / n).is_file() for n in (INTRINSIC, EXTRINSIC)) else None
+    meant = path.is_dir() or path.name.lower() in (INTRINSIC, EXTRINSIC)
+    return folder if meant and all(named(folder, n) for n in (INTRINSIC, EXTRINSIC)) else None
 
 
 def read(path: Path) -> Found:
     """The cameras in the order of the file's ``names``."""
-    intrinsic, extrinsic = read_filestorage(path / INTRINSIC), read_filestorage(path / EXTRINSIC)
+    inside, outside = (named(path, n) or path / n for n in (INTRINSIC, EXTRINSIC))
+    intrinsic, extrinsic = read_filestorage(inside), read_filestorage(outside)
     names = intrinsic.get("names")
-    if not isinstance(names, list) or not all(isinstance(n, str | int | float) and plain_name(str(n)) for n in names):
+    if not isinstance(names, list) or not all(isinstance(n, str | int | float) and _is_plain(str(n)) for n in names):
         raise FormatError(f"{path / INTRINSIC}: expected a list 'names' of cameras")
     return Found([_record(path, str(n), intrinsic, extrinsic) for n in names], path)
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a camera's name can be a file's or folder's name in a folder, and leads nowhere else."""
+    return bool(name) and name not in (".", "..") and not any(c in name for c in "/\\\0")
 
 
 def _record(path: Path, name: str, intrinsic: dict[str, Any], extrinsic: dict[str, Any]) -> Record:
@@ -51,7 +57,6 @@ def _record(path: Path, name: str, intrinsic: dict[str, Any], extrinsic: dict[st
         t=t.reshape(-1),
         width=width,
         height=height,
-        image=camera_image(path, name),
         name=name,
         distortion=storage_distortion(inside, intrinsic, (f"dist_{name}", f"D_{name}")),
     )

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InvalidInputError
+from .places import named
 from .poses import from_center
 from .records import Found, Record
 from .values import Entry, head, read_json
@@ -24,9 +25,9 @@ NAME = "cameras.json"
 def find(path: Path) -> Path | None:
     """The file at the path, or in the folder."""
     if path.is_dir():
-        path = path / NAME
+        path = named(path, NAME) or path / NAME
     start = head(path)
-    return path if path.suffix == ".json" and start.lstrip().startswith("[") and '"img_name"' in start else None
+    return path if path.suffix.lower() == ".json" and start.lstrip().startswith("[") and '"img_name"' in start else None
 
 
 def read(path: Path) -> Found:

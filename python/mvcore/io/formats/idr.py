@@ -13,6 +13,7 @@ from ...geometry.cameras import Camera
 from ...geometry.projections import cameras_from_projections
 from ..limits import read_npz
 from ..media import frame_files
+from .places import named
 from .records import Found, Record
 
 NAMES = ("cameras_sphere.npz", "cameras_large.npz", "cameras.npz")
@@ -25,8 +26,8 @@ MOST = 64 << 20
 def find(path: Path) -> Path | None:
     """The archive, if the path is one or holds one."""
     if path.is_file():
-        return path if path.suffix == ".npz" else None
-    return next((path / n for n in NAMES if (path / n).is_file()), None)
+        return path if path.suffix.lower() == ".npz" else None
+    return named(path, *NAMES)
 
 
 def read(path: Path) -> Found:
@@ -57,7 +58,6 @@ def _images(path: Path, numbers: list[int]) -> dict[int, Path]:
     folder = path.parent
     for base in (folder / "image", folder / "images", folder):
         files = frame_files(base) if base.is_dir() else []
-        files = [f for f in files if not f.name.startswith(".")]
         if not files:
             continue
         by_number = {int(f.stem): f for f in files if NUMBER.fullmatch(f.stem)}

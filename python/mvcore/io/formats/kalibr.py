@@ -1,4 +1,7 @@
-"""Kalibr ``camchain.yaml`` (or another name): a chain of cameras, ``T_cn_cnm1`` from the one before; the first is the world."""
+"""Kalibr ``camchain.yaml`` (or another name): a chain of cameras, ``T_cn_cnm1`` from the one before; the first is the world.
+
+OpenVINS' ``kalibr_imucam_chain.yaml`` has no chain but each camera's ``T_imu_cam`` (camera to IMU): there the IMU is the world.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import FormatError
+from ...errors import FormatError, InvalidInputError
 from ..limits import MOST_SIDE
-from .camera_folders import camera_image
 from .filestorage import read_yaml
+from .poses import from_camera_to_world
 from .records import Found, Record
+from .values import files_in
 
 MODELS = {"radtan": False, "equidistant": True, "none": False}
 """Distortion models, and whether each is OpenCV's fisheye: ``equidistant`` is, whatever its coefficients."""
@@ -23,9 +27,9 @@ LOOK = 4096
 def find(path: Path) -> Path | None:
     """A file whose name holds ``camchain``, or the only one in a folder; else one whose content is a chain of cameras."""
     if path.is_file():
-        return path if path.suffix in SUFFIXES and ("camchain" in path.name or _is_chain(path)) else None
-    files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES and f.is_file())
-    named = [f for f in files if "camchain" in f.name]
+        return path if path.suffix.lower() in SUFFIXES and ("camchain" in path.name.lower() or _is_chain(path)) else None
+    files = files_in(path, *SUFFIXES)
+    named = [f for f in files if "camchain" in f.name.lower()]
     chains = named or [f for f in files if _is_chain(f)]
     return chains[0] if len(chains) == 1 else None
 
@@ -38,7 +42,7 @@ def _is_chain(path: Path) -> bool:
 
 
 def read(path: Path) -> Found:
-    """``cam0``, ``cam1`` ... in this order; one image of each may lie beside the file (`camera_folders.camera_image`)."""
+    """``cam0``, ``cam1`` ... in this order."""
     documents = read_yaml(path)
     data = documents[0] if len(documents) == 1 else None
     chain = {k: v for k, v in data.items() if k.startswith("cam")} if isinstance(data, dict) else {}
@@ -46,12 +50,30 @@ def read(path: Path) -> Found:
     if not chain or set(names) != set(chain):
         got = ", ".join(chain) or "none"
         raise FormatError(f"{path}: expected cameras cam0, cam1 ..., got {got:.80}")
-    records, pose = [], np.eye(4)
-    for n, name in enumerate(names):
-        if n:
-            pose = _array(path, name, chain[name], "T_cn_cnm1", (4, 4)) @ pose
-        records.append(_record(path, name, chain[name], pose))
-    return Found(records, path)
+    poses = _poses(path, names, chain)
+    return Found([_record(path, name, chain[name], pose) for name, pose in zip(names, poses, strict=True)], path)
+
+
+def _poses(path: Path, names: list[str], chain: dict[str, Any]) -> list[np.ndarray]:
+    """World to camera: the first camera is the world, or the IMU where the file has no chain but ``T_cam_imu`` or ``T_imu_cam``."""
+    for key in ("T_cam_imu", "T_imu_cam"):
+        if all(isinstance(c, dict) and c.get(key) is not None for c in chain.values()) and not any(
+            "T_cn_cnm1" in c for c in chain.values()
+        ):
+            poses = [_array(path, n, chain[n], key, (4, 4)) for n in names]
+            return poses if key == "T_cam_imu" else [_inverse(path, n, p) for n, p in zip(names, poses, strict=True)]
+    out = [np.eye(4)]
+    for name in names[1:]:
+        out.append(_array(path, name, chain[name], "T_cn_cnm1", (4, 4)) @ out[-1])
+    return out
+
+
+def _inverse(path: Path, name: str, pose: np.ndarray) -> np.ndarray:
+    try:
+        r, t = from_camera_to_world(pose)
+    except InvalidInputError as error:
+        raise FormatError(f"{path}: {name}: T_imu_cam: {error}") from None
+    return np.vstack([np.column_stack([r, t]), [0, 0, 0, 1]])
 
 
 def _array(path: Path, name: str, camera: Any, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -84,7 +106,6 @@ def _record(path: Path, name: str, camera: Any, pose: np.ndarray) -> Record:
         t=pose[:3, 3],
         width=int(width),
         height=int(height),
-        image=camera_image(path.parent, name),
         name=name,
         distortion=distortion if any(distortion) or MODELS[kind] else (),
         fisheye=MODELS[kind],

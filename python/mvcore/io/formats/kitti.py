@@ -18,7 +18,7 @@ import numpy as np
 from ...errors import FormatError
 from .records import Found, Record
 from .trajectories import record
-from .values import Float, Rows, head, images_in
+from .values import Float, Rows, head, images_in, known_file, named
 
 LINE = re.compile(r"\s*P(?:_rect_0)?([0-3])\s*:")
 NAMES = ("calib.txt", "calib_cam_to_cam.txt")
@@ -28,8 +28,8 @@ PAIRS = (("2", "3"), ("0", "1"))
 def find(path: Path) -> Path | None:
     """A file with projection matrices, at the path or in the folder."""
     if path.is_dir():
-        return next((path / n for n in NAMES if find(path / n)), None)
-    lines = head(path, 1 << 16).splitlines() if path.suffix == ".txt" else []
+        return known_file(path, NAMES, find)
+    lines = head(path, 1 << 16).splitlines() if path.suffix.lower() == ".txt" else []
     return path if sum(LINE.match(line) is not None for line in lines) >= 2 else None
 
 
@@ -76,8 +76,8 @@ def _folder(base: Path, number: str) -> Path | None:
 
 
 def _poses(folder: Path) -> list[Float] | None:
-    for file in (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
-        if file.is_file():
+    for file in (named(folder, "poses.txt"), named(folder.parent.parent / "poses", f"{folder.name}.txt")):
+        if file is not None:
             rows = Rows(file)
             return [np.array(rows.numbers(n, line.split(), 12)).reshape(3, 4) for n, line in rows.content()]
     return None

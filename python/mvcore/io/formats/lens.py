@@ -1,8 +1,8 @@
 """Lens models of other tools as OpenCV's.
 
 Polynomials up to r⁶ and two tangential terms are OpenCV's own. Any other radial function is fitted by OpenCV's rational model
-(1 + k1 s + k2 s² + k3 s³) / (1 + k4 s + k5 s² + k6 s³), s = r²: for the smooth functions of lenses it agrees far below a pixel's
-thousandth, and where it does not the model is refused by name.
+(1 + k1 s + k2 s² + k3 s³) / (1 + k4 s + k5 s² + k6 s³), s = r²: for the smooth functions of lenses it agrees to a
+thousandth of a pixel or much better, and where it does not the model is refused by name.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from .values import Float
 
 NODES = 200
 """Radii at which a function is fitted."""
-TOLERANCE = 1e-4
+TOLERANCE = 1e-3
 """Largest deviation of the fit in pixels; features are located to about 0.1."""
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ...errors import FormatError, InvalidInputError
 from ..limits import MOST_SIDE
 from ..pairing import natural_order
-from .places import images_below
+from .places import images_below, named
 from .poses import from_center
 from .records import Found, Record, image_size
 from .values import Float, images_in
@@ -29,8 +29,8 @@ MOST_BYTES = 64 << 20
 def find(path: Path) -> Path | None:
     """The file at the path, or in the folder."""
     if path.is_dir():
-        path = path / NAME
-    return path if path.name == NAME and path.is_file() else None
+        path = named(path, NAME) or path / NAME
+    return path if path.name.lower() == NAME and path.is_file() else None
 
 
 def read(path: Path, images: Path | None = None) -> Found:

@@ -22,7 +22,7 @@ from ...errors import InvalidInputError
 from .lens import brown
 from .poses import from_center
 from .records import Found, Record
-from .values import Entry, Float, files_in, head, read_json
+from .values import Entry, Float, files_in, head, known_file, read_json
 
 NAMES = ("cameras.sfm", "sfm.sfm", "sfm.json")
 DISTORTIONS = {"pinhole": "none", "radial1": "radialk1", "radial3": "radialk3", "": "none"}
@@ -33,9 +33,8 @@ def find(path: Path) -> Path | None:
     """An SfM file, or the first in a folder by its usual names."""
     if path.is_file():
         start = head(path)
-        return path if start.lstrip().startswith("{") and (path.suffix == ".sfm" or '"viewId"' in start) else None
-    usual = [path / n for n in NAMES if (path / n).is_file()]
-    return next((f for f in [*usual, *files_in(path, ".sfm")] if find(f)), None)
+        return path if start.lstrip().startswith("{") and (path.suffix.lower() == ".sfm" or '"viewId"' in start) else None
+    return known_file(path, NAMES, find) or next((f for f in files_in(path, ".sfm") if find(f)), None)
 
 
 def read(path: Path) -> Found:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...types import Bounds
 from .records import Found, Lines, Record
+from .values import files_in
 
 # Digits are limited: the time to refuse a line of them alone would grow with the square of its length.
 NUMBER = r"([-+]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][-+]?\d{1,4})?)"
@@ -22,8 +23,8 @@ NAME = re.compile(r'\s*(?:"([^"]+)"|(\S+))\s+(.*)')
 def find(path: Path) -> Path | None:
     """The file, if the path is one or holds one."""
     if path.is_file():
-        return path if path.name.endswith("_par.txt") else None
-    return next(iter(sorted(path.glob("*_par.txt"))), None)
+        return path if path.name.lower().endswith("_par.txt") else None
+    return next((f for f in files_in(path, ".txt") if f.name.lower().endswith("_par.txt")), None)
 
 
 def read(path: Path) -> Found:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .records import Found, Record
-from .values import Entry, Float, Rows, head
+from .values import Entry, Float, Rows, head, known_file
 
 NAMES = ("calib.txt", "calib_gray.txt")
 LINE = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*$")
@@ -23,8 +23,8 @@ LINE = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*$")
 def find(path: Path) -> Path | None:
     """A file with ``cam0=[..]``, at the path or in the folder."""
     if path.is_dir():
-        return next((path / n for n in NAMES if find(path / n)), None)
-    return path if path.suffix == ".txt" and re.match(r"\s*cam0\s*=", head(path)) else None
+        return known_file(path, NAMES, find)
+    return path if path.suffix.lower() == ".txt" and re.match(r"\s*cam0\s*=", head(path)) else None
 
 
 def read(path: Path) -> Found:

@@ -15,14 +15,14 @@ from ...errors import FormatError
 from .places import IMAGE_FOLDERS, IMAGE_SUFFIXES, images_below
 from .records import Found, Lines, Record
 
-CAMERA = re.compile(r"^(\d+)_cam\.txt$")
+CAMERA = re.compile(r"^(\d+)_cam\.txt$", re.IGNORECASE)
 FOLDERS = ("cams", "cams_1", "Cameras", "cameras", ".")
 
 
 def find(path: Path) -> Path | None:
     """The scene's folder, if a folder of ``*_cam.txt`` is at the path."""
     if path.is_file():
-        path = path.parent if CAMERA.match(path.name) or path.name == "pair.txt" else Path()
+        path = path.parent if CAMERA.match(path.name) or path.name.lower() == "pair.txt" else Path()
     if not path.is_dir() or path == Path():
         return None
     if path.name in FOLDERS and _cameras(path) and _cameras(path.parent):
@@ -32,14 +32,14 @@ def find(path: Path) -> Path | None:
 
 def _cameras(folder: Path) -> list[Path]:
     for name in FOLDERS:
-        files = [f for f in (folder / name).glob("*_cam.txt") if CAMERA.match(f.name)] if (folder / name).is_dir() else []
+        files = [f for f in (folder / name).iterdir() if CAMERA.match(f.name)] if (folder / name).is_dir() else []
         if files:
             return sorted(files, key=_number)
     return []
 
 
 def _number(path: Path) -> int:
-    return int(path.name.removesuffix("_cam.txt"))
+    return int(path.name.partition("_")[0])
 
 
 def read(folder: Path) -> Found:
@@ -48,7 +48,7 @@ def read(folder: Path) -> Found:
     images = _images(folder, {_number(p) for p in cameras})
     records = []
     for path in cameras:
-        name = path.name.removesuffix("_cam.txt")
+        name = path.name.partition("_")[0]
         records.append(replace(read_camera(path), image=images.get(_number(path)), name=name))
     return Found(records, folder)
 

@@ -18,6 +18,7 @@ from ...errors import FormatError, InvalidInputError
 from ...geometry.projections import cameras_from_projections
 from ...types import Bounds
 from ..limits import read_json
+from .places import named
 from .records import Found, Record
 
 NAME = "cameras.json"
@@ -29,8 +30,8 @@ MOST_PIXELS = 1_000_000
 def find(path: Path) -> Path | None:
     """The file, if the path is one or holds one."""
     if path.is_dir():
-        return path / NAME if (path / NAME).is_file() else None
-    if path.suffix.lower() != ".json" or path.name.startswith("transforms"):
+        return named(path, NAME)
+    if path.suffix.lower() != ".json" or path.name.lower().startswith("transforms"):
         return None
     return path
 
@@ -91,8 +92,8 @@ def _record(path: Path, n: int, view: Any) -> Record:
     distortion = view.get("dist", view.get("dist_k1k2p1p2", ()))
     image = path_in(f"{where}: image", view.get("image"))
     return Record(
-        K=None if missing else numbers(f"{where}: K", view["K"], (3, 3)),
-        R=None if missing else numbers(f"{where}: R", view["R"], (3, 3)),
+        K=None if missing else numbers(f"{where}: K", view["K"], (3, 3), (9,)).reshape(3, 3),
+        R=None if missing else numbers(f"{where}: R", view["R"], (3, 3), (9,)).reshape(3, 3),
         t=None if missing else numbers(f"{where}: t", view["t"], (3,), (3, 1)).reshape(3),
         width=pixels(f"{where}: width", view.get("width")),
         height=pixels(f"{where}: height", view.get("height")),

@@ -1,11 +1,12 @@
 """NeRF, instant-ngp and nerfstudio ``transforms.json``: camera-to-world, OpenGL axes, corner origin.
 
 Values of a frame override common ones. ``camera_model`` names the projection (nerfstudio), or ``is_fisheye`` does
-(instant-ngp); without either, distortion is OpenCV's k1 k2 p1 p2 k3.
+(instant-ngp); without either, distortion is OpenCV's k1 k2 p1 p2 k3 with nerfstudio's k4, a factor of r⁸.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,11 @@ import numpy as np
 
 from ...errors import FormatError
 from ..limits import read_json
+from .lens import brown, corner_radius, polynomial
 from .native import numbers, path_in, pixels
+from .places import named
 from .records import Found, Record
+from .values import files_in
 
 NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -22,10 +26,11 @@ FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE
 
 
 def find(path: Path) -> Path | None:
-    """The file, if the path is one or holds one."""
+    """The file, if the path is one or holds one; of other names (``transforms_test.json``) the only one."""
     if path.is_file():
-        return path if path.name.startswith("transforms") and path.suffix.lower() == ".json" else None
-    return next((path / n for n in NAMES if (path / n).is_file()), None)
+        return path if path.name.lower().startswith("transforms") and path.suffix.lower() == ".json" else None
+    others = [f for f in files_in(path, ".json") if f.name.lower().startswith("transforms")]
+    return named(path, *NAMES) or (others[0] if len(others) == 1 else None)
 
 
 def read(path: Path) -> Found:
@@ -72,7 +77,7 @@ def _number(where: str, frame: dict[str, Any], key: str, default: float | None =
 def _matrix(where: str, frame: dict[str, Any], width: int, height: int) -> list[list[float]]:
     fx, fy = _number(where, frame, "fl_x"), _number(where, frame, "fl_y")
     if fx is None and fy is None:
-        fx, fy = (_focal(_number(where, frame, f"camera_angle_{a}"), side) for a, side in (("x", width), ("y", height)))
+        fx, fy = (_focal(_angle(where, frame, a), side) for a, side in (("x", width), ("y", height)))
     if fx is None and fy is None:
         raise FormatError(f"{where}: neither fl_x nor camera_angle_x (an angle of 0 to pi)")
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
@@ -80,11 +85,17 @@ def _matrix(where: str, frame: dict[str, Any], width: int, height: int) -> list[
     return [[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]  # type: ignore[operator, list-item]
 
 
+def _angle(where: str, frame: dict[str, Any], axis: str) -> float | None:
+    """The field of view in radians; instant-ngp also takes degrees."""
+    degrees = _number(where, frame, f"{axis}_fov")
+    return _number(where, frame, f"camera_angle_{axis}", None if degrees is None else float(np.radians(degrees)))
+
+
 def _focal(angle: float | None, side: int) -> float | None:
     return 0.5 * side / float(np.tan(0.5 * angle)) if angle is not None and 0 < angle < np.pi else None
 
 
-def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float], bool]:
+def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float] | Callable[[int, int], list[float]], bool]:
     """OpenCV's coefficients, and whether they are the fisheye model's."""
     model = str(frame.get("camera_model") or "").upper()
     if model and model not in (*PERSPECTIVE, *FISHEYE):
@@ -100,7 +111,16 @@ def _lens(where: str, frame: dict[str, Any]) -> tuple[list[float], bool]:
         return [k1, k2, k3, k4], True
     if model == "FULL_OPENCV":
         return [k1, k2, p1, p2, k3, k4, k5, k6], False
-    if k4:
-        raise FormatError(f"{where}: k4: expected 0 for a perspective camera (OpenCV has three radial terms), got {k4:g}; is it a fisheye?")
-    values = [k1, k2, p1, p2, k3]
-    return (values if any(values) else []), False
+    if not k4:
+        return brown(k1, k2, p1, p2, k3), False
+    return lambda width, height: _four_terms(where, frame, width, height, [k1, k2, k3, k4], p1, p2), False
+
+
+def _four_terms(where: str, frame: dict[str, Any], width: int, height: int, radial: list[float], p1: float, p2: float) -> list[float]:
+    """nerfstudio's 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸ as OpenCV's rational model."""
+    matrix = np.array(_matrix(where, frame, width, height))
+    values = polynomial(radial, p1, p2, float(matrix[0, 0]), corner_radius(matrix, width, height))
+    if values is None:
+        text = ", ".join(f"{v:g}" for v in radial)
+        raise FormatError(f"{where}: k1 .. k4: expected a distortion that does not turn back in the image, got {text}; is it a fisheye?")
+    return values

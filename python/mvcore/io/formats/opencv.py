@@ -1,4 +1,4 @@
-"""OpenCV FileStorage (YAML, XML or JSON): one file a camera, or a stereo calibration with M1, D1, M2, D2, R, T.
+"""OpenCV FileStorage (YAML, XML or JSON), one file a camera (two in one: `stereo`).
 
 Of a camera file: ``camera_matrix`` (K), ``distortion_coefficients`` (D), ``rvec`` or ``R``, ``tvec`` (T), ``image_width`` and
 ``image_height`` and, if it is not the file's own name, ``image``.
@@ -7,6 +7,7 @@ Of a camera file: ``camera_matrix`` (K), ``distortion_coefficients`` (D), ``rvec
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ...errors import FormatError
 from ..limits import MOST_SIDE
 from .filestorage import read_filestorage
 from .records import Found, Record, image_in
+from .values import files_in, head
 
 SUFFIXES = (".yml", ".yaml", ".xml")
 KEYS = {
@@ -29,35 +31,33 @@ KEYS = {
     "image": ("image", "image_name", "filename"),
     "width": ("image_width", "width"),
     "height": ("image_height", "height"),
-    "K1": ("M1", "K1"),
-    "K2": ("M2", "K2"),
-    "D1": ("D1",),
-    "D2": ("D2",),
 }
+
+SNIFF = 1 << 16
+"""Bytes that are searched for the name of the camera matrix."""
+MATRIX = re.compile(rf"""^[ \t]*["<]?(?:{"|".join(KEYS["K"])})["> \t:]""", re.MULTILINE)
 
 
 def find(path: Path) -> Path | None:
     """A storage file, or a folder of some."""
     if path.is_file():
-        return path if path.suffix in SUFFIXES else None
+        return path if path.suffix.lower() in SUFFIXES else None
     return path if _files(path) else None
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(f for f in folder.iterdir() if f.suffix in SUFFIXES)
+    return files_in(folder, *SUFFIXES)
 
 
 def read(path: Path) -> Found:
     """The cameras of a file or a folder, by name."""
-    files = [path] if path.is_file() else _files(path)
-    return Found([record for file in files for record in _file(file)], path)
-
-
-def _file(path: Path) -> list[Record]:
-    storage = read_filestorage(path)
-    if any(storage.get(k) is not None for k in KEYS["K1"]):
-        return _stereo(path, storage)
-    return [_camera(path, storage)]
+    if path.is_file():
+        return Found([_camera(path, read_filestorage(path))], path)
+    files = _files(path)
+    cameras = [f for f in files if MATRIX.search(head(f, SNIFF))] or files
+    others = [f.name for f in files if f not in cameras]
+    warnings = (f"{len(others)} files without a camera matrix left out: {', '.join(others[:5])}",) if others else ()
+    return Found([_camera(f, read_filestorage(f)) for f in cameras], path, warnings=warnings)
 
 
 def storage_value(path: Path, storage: dict[str, Any], names: Sequence[str]) -> Any:
@@ -147,29 +147,3 @@ def storage_distortion(path: Path, storage: dict[str, Any], names: Sequence[str]
     distortion = storage_matrix(path, storage, names, (0, 1, 2, 4, 5, 8, 12, 14))
     values = [] if distortion is None else distortion.reshape(-1).tolist()
     return [*values, *[0.0] * (4 - len(values))] if any(values) else []
-
-
-def _stereo(path: Path, storage: dict[str, Any]) -> list[Record]:
-    r, t = (storage_matrix(path, storage, KEYS[k], n) for k, n in (("R", (3, 9)), ("t", (3,))))
-    if r is None or t is None:
-        raise FormatError(f"{path}: R and T of the second camera missing")
-    width, height = storage_size(path, storage, KEYS["width"], KEYS["height"])
-    records = []
-    for n, (rotation, shift) in enumerate(((np.eye(3), np.zeros(3)), (rotation_of(r), t.reshape(-1))), 1):
-        matrix = storage_matrix(path, storage, KEYS[f"K{n}"], (9,))
-        if matrix is None:
-            raise FormatError(f"{path}: M{n} missing")
-        image = next((i for s in (("left", "im0", "view1"), ("right", "im1", "view5"))[n - 1] if (i := image_in(path.parent, s))), None)
-        records.append(
-            Record(
-                K=matrix.reshape(3, 3),
-                R=rotation,
-                t=shift,
-                width=width,
-                height=height,
-                image=image,
-                name=image.name if image else ("left", "right")[n - 1],
-                distortion=storage_distortion(path, storage, KEYS[f"D{n}"]),
-            )
-        )
-    return records

@@ -30,10 +30,10 @@ def find(path: Path) -> Path | None:
     """The file, or the one of that name in a folder or its ``opensfm`` folder."""
     if path.is_file():
         start = head(path)
-        known = path.name == NAME or '"projection_type"' in start
+        known = path.name.lower() == NAME or '"projection_type"' in start
         return path if path.suffix.lower() == ".json" and start.lstrip().startswith("[") and known else None
     for folder in (path, path / "opensfm"):
-        if (found := next((f for f in files_in(folder, ".json") if f.name == NAME and find(f)), None)) is not None:
+        if (found := next((f for f in files_in(folder, ".json") if f.name.lower() == NAME and find(f)), None)) is not None:
             return found
     return None
 

@@ -22,6 +22,7 @@ from ...errors import FormatError
 from ..pairing import natural_order, pair_by_name
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".exr", ".heic", ".heif")
+SUFFIXES = (*IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES))
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "color", "photos", "frames", "blended_images", "undistorted", "undistorted_images")
 """Usual names of folders of images, the surest first."""
 MASK_FOLDERS = ("masks", "mask", "silhouettes", "mattes")
@@ -153,6 +154,18 @@ def no_images(wanted: Sequence[Wanted], at: Places) -> FormatError:
     return FormatError(f"{at.base}: {what}; looked in {at.root} and its folders; name the folder with images=DIR (--images DIR)")
 
 
+def named(folder: Path, *names: str) -> Path | None:
+    """The first of the names that is a file in a folder, whatever its case; None where there is none."""
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    try:
+        there = {n.lower(): folder / n for n in sorted(os.listdir(folder))}
+    except OSError:
+        return None
+    return next((there[n.lower()] for n in names if n.lower() in there and there[n.lower()].is_file()), None)
+
+
 def _plain(path: Path) -> Path:
     return Path(os.path.normpath(path))
 
@@ -184,7 +197,8 @@ def with_suffix(path: Path) -> Path | None:
     """An image's path as it is, or with a usual suffix added; None where there is no such file."""
     if path.suffix.lower() in IMAGE_SUFFIXES:
         return path if _is_file(path) else None
-    return next((p for s in IMAGE_SUFFIXES if _is_file(p := path.with_name(path.name + s))), None) if path.name else None
+    text = str(path)
+    return next((Path(text + s) for s in SUFFIXES if os.path.isfile(text + s)), None) if path.name else None
 
 
 def _is_file(path: Path) -> bool:

@@ -14,9 +14,9 @@ import numpy as np
 
 from ...errors import FormatError
 from ..limits import MOST_SIDE
-from .camera_folders import camera_image
 from .filestorage import read_xml
 from .records import Found, Record
+from .values import files_in
 
 SUBPIXELS = 64.0
 MOST = 1e12
@@ -26,8 +26,8 @@ MOST = 1e12
 def find(path: Path) -> Path | None:
     """A ``.qca.txt`` file, or the only one in a folder or in its ``calibration`` folder."""
     if path.is_file():
-        return path if path.name.endswith(".qca.txt") else None
-    files = [f for folder in (path, path / "calibration") if folder.is_dir() for f in sorted(folder.glob("*.qca.txt"))]
+        return path if path.name.lower().endswith(".qca.txt") else None
+    files = [f for folder in (path, path / "calibration") for f in files_in(folder, ".txt") if f.name.lower().endswith(".qca.txt")]
     return files[0] if len(files) == 1 else None
 
 
@@ -75,7 +75,6 @@ def _record(path: Path, number: int, camera: ElementTree.Element) -> Record:
         t=-rotation @ position,
         width=round(width),
         height=round(height),
-        image=camera_image(path.parent, name),
         name=name,
         distortion=(distortion if distortion[4] else distortion[:4]) if any(distortion) else (),
     )

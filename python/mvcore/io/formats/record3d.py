@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import InvalidInputError
 from .poses import OPENGL, from_center, quaternion
 from .records import Found, Record
-from .values import Entry, Float, head, images_in, read_json
+from .values import Entry, Float, head, images_in, known_file, read_json
 
 NAMES = ("metadata", "metadata.json")
 FOLDERS = ("EXR_RGBD/rgb", "rgb", "rgbd", "images")
@@ -26,8 +26,8 @@ def find(path: Path) -> Path | None:
     """The metadata at the path, or in the folder."""
     if path.is_file():
         start = head(path)
-        return path if path.name in NAMES and start.lstrip().startswith("{") and ('"poses"' in start or '"K"' in start) else None
-    return next((path / n for n in NAMES if find(path / n)), None) if path.is_dir() else None
+        return path if path.name.lower() in NAMES and start.lstrip().startswith("{") and ('"poses"' in start or '"K"' in start) else None
+    return known_file(path, NAMES, find) if path.is_dir() else None
 
 
 def read(path: Path) -> Found:

@@ -15,7 +15,7 @@ import numpy as np
 from ...errors import FormatError
 from .records import Found
 from .trajectories import find_intrinsics, path_of, read_intrinsics
-from .values import Rows, head, images_in
+from .values import Rows, head, images_in, named
 
 NAME = "traj.txt"
 FOLDERS = ("results", "rgb", "color", "images")
@@ -24,8 +24,8 @@ FOLDERS = ("results", "rgb", "color", "images")
 def find(path: Path) -> Path | None:
     """``traj.txt`` with lines of 16 numbers."""
     if path.is_dir():
-        path = path / NAME
-    lines = head(path).splitlines() if path.name == NAME else []
+        path = named(path, NAME) or path / NAME
+    lines = head(path).splitlines() if path.name.lower() == NAME else []
     return path if lines and len(lines[0].split()) > 8 else None
 
 

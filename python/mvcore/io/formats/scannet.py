@@ -13,7 +13,7 @@ from pathlib import Path
 from ..pairing import natural_order
 from .records import Found
 from .trajectories import path_of, read_intrinsics, read_matrix
-from .values import files_in, images_in
+from .values import files_in, images_in, named
 
 COLOURS = ("color", "rgb", "images")
 INTRINSICS = ("intrinsic/intrinsic_color.txt", "intrinsics/intrinsic_color.txt", "intrinsic_color.txt", "intrinsics_color.txt",
@@ -23,16 +23,19 @@ INTRINSICS = ("intrinsic/intrinsic_color.txt", "intrinsics/intrinsic_color.txt",
 def find(path: Path) -> Path | None:
     """The folder that holds ``pose`` and the intrinsics; a file in one of its folders stands for it."""
     if path.is_file():
-        if path.suffix != ".txt" or path.parent.name not in ("pose", "intrinsic", "intrinsics"):
+        if path.suffix.lower() != ".txt" or path.parent.name not in ("pose", "intrinsic", "intrinsics"):
             return None
         path = path.parent.parent
-    intrinsics = any((path / n).is_file() for n in INTRINSICS)
-    return path if intrinsics and (path / "pose").is_dir() else None
+    return path if _intrinsics(path) is not None and (path / "pose").is_dir() else None
+
+
+def _intrinsics(path: Path) -> Path | None:
+    return next((f for n in INTRINSICS if (f := named((path / n).parent, Path(n).name)) is not None), None)
 
 
 def read(path: Path) -> Found:
     """The frames in natural order."""
-    lens = read_intrinsics(next(path / n for n in INTRINSICS if (path / n).is_file()))
+    lens = read_intrinsics(_intrinsics(path) or path / INTRINSICS[0])
     folder = next((c for c in COLOURS if images_in(path / c)), COLOURS[0])
     poses = sorted(files_in(path / "pose", ".txt"), key=natural_order)
     frames = [(str(pose), read_matrix(pose), Path(folder) / pose.stem) for pose in poses]

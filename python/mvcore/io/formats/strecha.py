@@ -8,18 +8,20 @@ import numpy as np
 
 from ..pairing import natural_order
 from .records import Found, Lines, Record
+from .values import files_in
 
 
 def find(path: Path) -> Path | None:
     """The folder of ``.camera`` files."""
     if path.is_file():
-        return path.parent if path.suffix == ".camera" else None
-    return next((f for f in (path, path / "images", path / "cameras") if any(f.glob("*.camera"))), None)
+        return path.parent if path.suffix.lower() == ".camera" else None
+    folders = sorted(f for f in path.iterdir() if f.is_dir() and not f.name.startswith("."))
+    return next((f for f in (path, path / "images", path / "cameras", *folders) if files_in(f, ".camera")), None)
 
 
 def read(folder: Path) -> Found:
     """The views of a folder, by name."""
-    return Found([_view(folder, path) for path in sorted(folder.glob("*.camera"), key=natural_order)], folder)
+    return Found([_view(folder, path) for path in sorted(files_in(folder, ".camera"), key=natural_order)], folder)
 
 
 def _view(folder: Path, path: Path) -> Record:
@@ -31,6 +33,6 @@ def _view(folder: Path, path: Path) -> Record:
     width, height = lines.numbers(9, 2)
     if not (width > 0 and height > 0):
         raise lines.fail(9, f"expected width and height above 0, got {width:g} {height:g}")
-    name = path.name.removesuffix(".camera")
+    name = path.stem
     # The centre stays, also where R is rounded (`Camera`).
     return Record(K=k, R=rotation, t=-rotation @ center, width=int(width), height=int(height), image=Path(name), name=name, line=1)

@@ -11,7 +11,7 @@ from ...errors import FormatError, InvalidInputError
 from .lens import brown
 from .poses import from_camera_to_world
 from .records import Found, Record
-from .values import Entry, Float, Rows, read_json
+from .values import Entry, Float, Rows, named, read_json
 
 INTRINSICS = (
     "camera.txt", "intrinsics.txt", "intrinsic.txt", "camera_intrinsics.txt", "camera-intrinsics.txt", "K.txt", "calibration.txt",
@@ -25,7 +25,7 @@ Lens = tuple[Float, list[float], int, int]
 
 def find_intrinsics(*folders: Path) -> Path | None:
     """The first file of intrinsics in some folders."""
-    return next((f / n for f in folders for n in INTRINSICS if (f / n).is_file()), None)
+    return next((p for f in folders if (p := named(f, *INTRINSICS)) is not None), None)
 
 
 def read_intrinsics(path: Path) -> Lens:
@@ -34,7 +34,7 @@ def read_intrinsics(path: Path) -> Lens:
     Text: ``fx fy cx cy [k1 k2 p1 p2 [k3]]``, or K as 3 x 3 or 4 x 4. JSON: an object, or one in ``camera``, with fx fy cx cy, and w h or
     width height. Pixel centres are at integers.
     """
-    if path.suffix == ".json":
+    if path.suffix.lower() == ".json":
         root = read_json(path)
         camera = root.get("camera") or root
         fx, fy, cx, cy = (camera.need(n).number() for n in ("fx", "fy", "cx", "cy"))

@@ -18,7 +18,7 @@ from ...errors import FormatError, InvalidInputError
 from .poses import quaternion
 from .records import Found
 from .trajectories import Lens, find_intrinsics, path_of, read_intrinsics
-from .values import Float, Rows, head, images_in
+from .values import Float, Rows, head, images_in, known_file, named
 
 NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt", "poses.txt", "traj.txt")
 FOLDERS = ("rgb", "color", "images")
@@ -35,8 +35,8 @@ BENCHMARK = {
 def find(path: Path) -> Path | None:
     """A trajectory of eight numbers a line, at the path or in the folder."""
     if path.is_dir():
-        return next((path / n for n in NAMES if find(path / n)), None)
-    lines = [line.split() for line in head(path).splitlines() if line.strip()] if path.suffix == ".txt" else []
+        return known_file(path, NAMES, find)
+    lines = [line.split() for line in head(path).splitlines() if line.strip()] if path.suffix.lower() == ".txt" else []
     data = [line for line in lines if not line[0].startswith("#")]
     titled = any("qx" in line and "tx" in line for line in lines)
     fits = any(len(line) == 8 and all(_time(word) is not None for word in line) for line in data)
@@ -78,8 +78,8 @@ def read(path: Path, images: Path | None = None) -> Found:
 
 
 def _timed_images(folder: Path, images: Path | None) -> list[tuple[float, Path]]:
-    listed = folder / "rgb.txt"
-    if listed.is_file():
+    listed = named(folder, "rgb.txt")
+    if listed is not None:
         rows = Rows(listed)
         found = [(rows.numbers(n, line.split()[:1])[0], line.split(None, 1)[1:]) for n, line in rows.content()]
         return [(time, Path(name[0])) for time, name in found if name]

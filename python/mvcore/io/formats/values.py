@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from ...errors import FormatError
 from .. import limits
 from ..limits import MOST_SIDE, read_text
 from ..pairing import natural_order
-from .places import IMAGE_SUFFIXES
+from .places import IMAGE_SUFFIXES, named
 
 try:
     import tomllib
@@ -190,6 +190,11 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def known_file(folder: Path, names: Sequence[str], knows: Callable[[Path], Path | None]) -> Path | None:
+    """The first file of one of the names in a folder whose content a format knows."""
+    return next((f for n in names if (f := named(folder, n)) is not None and knows(f)), None)
+
+
 def head(path: Path, size: int = HEAD) -> str:
     """The first characters of a regular file, without a byte order mark; empty where there is none to read."""
     try:
@@ -207,7 +212,7 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def files_in(folder: Path, *suffixes: str) -> list[Path]:
-    """A folder's files with one of the suffixes (lower case), by name; none where it is no folder."""
+    """A folder's files with one of the suffixes (lower case), by name, hidden ones apart; none where it is no folder."""
     if not folder.is_dir():
         return []
-    return sorted(f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file())
+    return sorted(f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".") and f.is_file())

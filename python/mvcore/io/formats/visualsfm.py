@@ -17,13 +17,16 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InvalidInputError
+from ...geometry.cameras import rotation_from
 from .lens import corner_radius, measured
 from .poses import from_center, quaternion
 from .records import Found, Record
 from .values import Float, Rows, files_in, head
 
-CAMERA = re.compile(r'^(?:"(?P<quoted>[^"]*)"|(?P<name>.*\S))\s+(?P<numbers>(?:\S+\s+){9}\S+)$')
-"""A name, which may hold spaces, before ten numbers."""
+COUNTS = {"NVM_V3": 10, "NVM_V3_R9T": 15}
+"""Numbers of a camera: focal length, quaternion and centre, or R (9) and t (3), radial term, 0."""
+CAMERAS = {n: re.compile(rf'^(?:"(?P<quoted>[^"]*)"|(?P<name>.*\S))\s+(?P<numbers>(?:\S+\s+){{{n - 1}}}\S+)$') for n in COUNTS.values()}
+"""A name, which may hold spaces, before so many numbers."""
 
 
 def find(path: Path) -> Path | None:
@@ -40,15 +43,16 @@ def read(path: Path) -> Found:
     content = rows.content()
     line, first = next(content, (1, ""))
     words = first.split()
-    if not words or words[0] != "NVM_V3":
+    if not words or words[0] not in COUNTS:
         raise rows.fail(line, f"expected NVM_V3, got {first!r:.30}")
+    numbers = COUNTS[words[0]]
     fixed = _fixed(rows, line, words[1:])
     line, text = next(content, (len(rows.lines), ""))
     count = rows.numbers(line, text.split(), 1)[0]
     if not 0 < count <= len(rows.lines) or count != int(count):
         raise rows.fail(line, f"expected a number of cameras that the file can hold, got {text!r:.30}")
     cameras = [next(content, (len(rows.lines), "")) for _ in range(int(count))]
-    return Found([_record(rows, at, camera, fixed) for at, camera in cameras], path)
+    return Found([_record(rows, at, camera, fixed, numbers) for at, camera in cameras], path)
 
 
 def _fixed(rows: Rows, line: int, words: list[str]) -> Float | None:
@@ -58,16 +62,19 @@ def _fixed(rows: Rows, line: int, words: list[str]) -> Float | None:
     return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
 
 
-def _record(rows: Rows, line: int, text: str, fixed: Float | None) -> Record:
-    parts = CAMERA.match(text)
+def _record(rows: Rows, line: int, text: str, fixed: Float | None, count: int) -> Record:
+    parts = CAMERAS[count].match(text)
     if parts is None:
-        raise rows.fail(line, f"expected a file name and 10 numbers, got {text!r:.60}")
-    name = parts["quoted"] or parts["name"]
-    f, qw, qx, qy, qz, x, y, z, radial, _ = rows.numbers(line, parts["numbers"].split(), 10)
+        raise rows.fail(line, f"expected a file name and {count} numbers, got {text!r:.60}")
+    name = parts["quoted"] or parts["name"].replace('"', " ")  # which stand for blanks
+    f, *pose, radial, _ = rows.numbers(line, parts["numbers"].split(), count)
     if f <= 0:
         raise rows.fail(line, f"expected a positive focal length, got {f:g}")
     try:
-        r, t = from_center(quaternion(qw, qx, qy, qz), np.array([x, y, z]))
+        if len(pose) == 12:
+            r, t = rotation_from(np.reshape(pose[:9], (3, 3))), np.array(pose[9:])
+        else:
+            r, t = from_center(quaternion(*pose[:4]), np.array(pose[4:]))
     except InvalidInputError as error:
         raise rows.fail(line, str(error)) from None
 

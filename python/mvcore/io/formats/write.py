@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,17 @@ from numpy.typing import NDArray
 
 from ...errors import InvalidInputError, MvcoreError, require
 from ...geometry.cameras import Calibration, Camera
+from ...geometry.projections import MIRROR
 from ...geometry.rig import convergence
 from ...types import Bounds, Frame, SparsePoints
 from ..files import atomically, staged
 from ..images import read_image
 from ..scene import Scene
-from .colmap import rotation_to_quaternion
+from .colmap import MODELS, rotation_to_quaternion
+from .places import IMAGE_FOLDERS, dataset_root
 
 FORMATS = ("mvcore", "colmap", "nerfstudio", "mvsnet")
+MODEL_IDS = {name: number for number, (name, _) in MODELS.items()}
 GREY = 128
 """Colour of a point that no image shows."""
 PLANES = 192
@@ -43,8 +48,10 @@ def save_calibration(path: str | Path, scene: Scene, format: str = "mvcore", *, 
     Parameters
     ----------
     path : the file of ``mvcore`` and ``nerfstudio`` (or its folder: transforms.json), the folder of ``colmap`` (cameras.txt,
-        images.txt, points3D.txt) and ``mvsnet`` (cams/, pair.txt).
+        images.txt, points3D.txt; binary where an image's name has blanks, which COLMAP's text cannot hold) and ``mvsnet`` (cams/,
+        pair.txt).
     format : ``mvcore``, ``colmap``, ``nerfstudio`` or ``mvsnet``.
+        Only ``mvcore`` holds a mirrored world (as bare projection matrices); the others get its reflection in z.
     points : triangulated features of the scene's views, (V, N) visible in its order: COLMAP's points and tracks, nerfstudio's
         ``ply_file_path``, MVSNet's depth ranges and view scores.
 
@@ -58,13 +65,16 @@ def save_calibration(path: str | Path, scene: Scene, format: str = "mvcore", *, 
     >>> mvcore.save_calibration("model", scene, "colmap", points=points)  # doctest: +SKIP
     """
     require(format in FORMATS, "format", f"one of {', '.join(FORMATS)}", repr(format))
+    require(len(scene) > 0, "scene", "one or more views", "none")
     if points is not None:
         require(points.visible.shape == (len(scene), len(points)), "points", f"visible of shape ({len(scene)}, N)", points.visible.shape)
     writers = {"colmap": _colmap, "nerfstudio": _nerfstudio, "mvsnet": _mvsnet}
     if format == "mvcore":
         _native(Path(path), scene)
-    else:
-        writers[format](Path(path), scene, points)
+        return
+    if scene.mirrored and scene.bounds is not None:
+        scene = replace(scene, bounds=np.sort(np.asarray(scene.bounds) * np.diag(MIRROR)[:3], axis=0))
+    writers[format](Path(path), scene, points)
 
 
 def _names(scene: Scene, base: Path) -> list[str]:
@@ -73,10 +83,17 @@ def _names(scene: Scene, base: Path) -> list[str]:
     for n, camera in enumerate(scene.calib):
         frame = scene.frames[n] if n < len(scene.frames) else None
         if isinstance(frame, str | Path):
-            names.append(os.path.relpath(frame, base))
+            names.append(_relative(frame, base))
         else:
             names.append(camera.name or f"{n:06d}.png")
     return names
+
+
+def _relative(file: str | Path, base: Path) -> str:
+    try:
+        return Path(os.path.relpath(file, base)).as_posix()
+    except ValueError:  # another disk
+        return Path(file).absolute().as_posix()
 
 
 def _text(path: Path, text: str) -> None:
@@ -88,12 +105,21 @@ def _write(path: Path, text: str) -> None:
 
 
 def _native(path: Path, scene: Scene) -> None:
+    base = path.parent.absolute()
     views = []
-    for camera, name in zip(scene.calib, _names(scene, path.parent.absolute()), strict=True):
+    for n, (camera, name) in enumerate(zip(scene.calib, _names(scene, base), strict=True)):
         view: dict[str, Any] = {"image": name, "width": camera.width, "height": camera.height}
-        view |= {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist()}
+        if camera.name and camera.name != name:
+            view["name"] = camera.name
+        if scene.mirrored:
+            view["P"] = (camera.projection @ MIRROR).tolist()
+        else:
+            view |= {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist()}
         if camera.distortion.size:
             view |= {"dist": camera.distortion.tolist(), "fisheye": camera.fisheye}
+        mask = scene.masks[n] if scene.masks is not None and not scene.alpha else None
+        if isinstance(mask, str | Path):
+            view["mask"] = _relative(mask, base)
         views.append(view)
     data: dict[str, Any] = {"convention": "x ~ K (R X + t); OpenCV axes (x right, y down, z forward); pixel centres at integer coordinates"}
     if scene.bounds is not None:
@@ -124,13 +150,16 @@ def _in_folder(path: Path, fill: Callable[[Path], None]) -> None:
 
 
 def _short_names(scene: Scene) -> list[str]:
-    """Image names from their ``images`` folder on."""
-    names = []
-    for n, camera in enumerate(scene.calib):
-        frame = scene.frames[n] if n < len(scene.frames) else None
-        parts = Path(frame if isinstance(frame, str | Path) else camera.name or f"{n:06d}.png").parts
-        names.append("/".join(parts[parts.index("images") + 1 :]) if "images" in parts[:-1] else parts[-1])
-    return names
+    """Image names from the folder that holds them all on: the data set's ``images``, ``rgb`` .., else the deepest common one."""
+    given = [scene.frames[n] if n < len(scene.frames) else None for n in range(len(scene))]
+    files = [Path(f).absolute() for f in given if isinstance(f, str | Path)]
+    if len(files) < len(given):
+        return [Path(f).name if isinstance(f, str | Path) else c.name or f"{n:06d}.png" for n, (f, c) in enumerate(zip(given, scene.calib))]
+    common = Path(os.path.commonpath([f.parent for f in files]))
+    root = dataset_root(Path(scene.calib.source).absolute().parent) if scene.calib.source else common
+    inside = [p for p in (common, *common.parents) if p.is_relative_to(root) and p != root]
+    base = next((p for p in inside if p.name.lower() in IMAGE_FOLDERS), common)
+    return [f.relative_to(base).as_posix() for f in files]
 
 
 def _pixels(camera: Camera, positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -185,12 +214,42 @@ def _colmap(path: Path, scene: Scene, points: SparsePoints | None) -> None:
         observed = " ".join(f"{u + 0.5:.6f} {v + 0.5:.6f} {p}" for (u, v), p in zip(x, numbers, strict=True))
         images += [f"{n + 1} {' '.join(repr(float(v)) for v in pose)} {shared[lines[n]]} {name}", observed]
 
+    model = {"cameras": cameras, "images": images, "points3D": _colmap_points(scene, points, seen)}
+
     def fill(folder: Path) -> None:
-        _write(folder / "cameras.txt", "\n".join(cameras) + "\n")
-        _write(folder / "images.txt", "\n".join(images) + "\n")
-        _write(folder / "points3D.txt", "\n".join(_colmap_points(scene, points, seen)) + "\n")
+        if any(c.isspace() for name in names for c in name):  # COLMAP ends a name at a blank in its text files
+            _colmap_binary(folder, model, names)
+            return
+        for part, lines in model.items():
+            _write(folder / f"{part}.txt", "\n".join(lines) + "\n")
 
     _in_folder(path, fill)
+
+
+def _colmap_binary(folder: Path, model: dict[str, list[str]], names: Sequence[str]) -> None:
+    """The rows of a text model as COLMAP's binary files."""
+    cameras = [line.split() for line in model["cameras"][1:]]
+    out = [struct.pack("<Q", len(cameras))]
+    for number, kind, width, height, *values in cameras:
+        head = (int(number), MODEL_IDS[kind], int(width), int(height))
+        out.append(struct.pack(f"<iiQQ{len(values)}d", *head, *map(float, values)))
+    (folder / "cameras.bin").write_bytes(b"".join(out))
+    rows = model["images"][1:]
+    out = [struct.pack("<Q", len(names))]
+    for name, image, seen in zip(names, rows[::2], rows[1::2], strict=True):
+        number, *pose, camera = image.split(maxsplit=9)[:9]
+        words = seen.split()
+        out.append(struct.pack("<i7di", int(number), *map(float, pose), int(camera)) + name.encode() + b"\0")
+        out.append(struct.pack("<Q", len(words) // 3))
+        out += [struct.pack("<ddq", float(u), float(v), int(p)) for u, v, p in zip(*[iter(words)] * 3, strict=True)]
+    (folder / "images.bin").write_bytes(b"".join(out))
+    points = [line.split() for line in model["points3D"][1:]]
+    out = [struct.pack("<Q", len(points))]
+    for number, *values in points:
+        position, colour, error, track = values[:3], values[3:6], values[6], values[7:]
+        out.append(struct.pack("<Q3d3Bd", int(number), *map(float, position), *map(int, colour), float(error)))
+        out.append(struct.pack(f"<Q{len(track)}i", len(track) // 2, *map(int, track)))
+    (folder / "points3D.bin").write_bytes(b"".join(out))
 
 
 def _colmap_points(scene: Scene, points: SparsePoints | None, seen: Sequence[NDArray[np.float64]]) -> list[str]:
