@@ -184,7 +184,7 @@ def locate(
     ``least`` and ``margin`` are those of `VideoConfig`.
     """
     every = list(_Masks(views)) if masks is None else list(masks)
-    findings = Findings(warnings=[f"masks: {w}" for w in mask_warnings(every)] if masks is None else [])
+    findings = Findings(warnings=mask_warnings(every) if masks is None else [])
     hull = bounded_hull(every, cameras, box, carving)
     parts, hulls = find_targets(hull, every, cameras, least)
     if not parts:

@@ -61,33 +61,38 @@ pub fn project(m: &[f64; 12], p: [f64; 3]) -> [f64; 3] {
 
 /// For each face the faces beyond its edges (0-1, 1-2, 2-0), [`NOTHING`] at a border or where three or more meet.
 pub fn neighbours(faces: &[[u32; 3]]) -> Vec<[i32; 3]> {
-    let vertices = faces.par_iter().map(|f| f[0].max(f[1]).max(f[2])).max().map_or(0, |v| v as usize + 1);
-    // The sides (higher vertex, number) of each lower vertex, in one array: a counting sort.
-    let ends = |side: usize| {
-        let (a, b) = (faces[side / 3][side % 3], faces[side / 3][(side + 1) % 3]);
-        (a.min(b) as usize, a.max(b))
+    let end = faces.par_iter().map(|f| f[0].max(f[1]).max(f[2])).max().map_or(1, |v| u64::from(v) + 1);
+    // A counting sort of the sides by their lower vertex, or a range of vertices where few have faces.
+    let buckets = end.min(3 * faces.len() as u64).max(1);
+    let ends = |side: u32| {
+        let (face, e) = (faces[side as usize / 3], side as usize % 3);
+        let (a, b) = (face[e], face[(e + 1) % 3]);
+        (a.min(b), a.max(b))
     };
-    let mut first = vec![0u32; vertices + 1];
-    (0..3 * faces.len()).for_each(|side| first[ends(side).0] += 1);
+    let bucket = |side: u32| (u64::from(ends(side).0) * buckets / end) as usize;
+    let mut first = vec![0u32; buckets as usize + 1];
+    let count = 3 * faces.len() as u32;
+    (0..count).for_each(|side| first[bucket(side)] += 1);
     let mut sum = 0;
     for f in &mut first {
         sum += *f;
         *f = sum;
     }
-    let mut sides = vec![(0u32, 0u32); 3 * faces.len()];
-    for side in (0..sides.len()).rev() {
-        let (low, high) = ends(side);
-        first[low] -= 1;
-        sides[first[low] as usize] = (high, side as u32);
+    let mut sides = vec![0u32; count as usize];
+    for side in (0..count).rev() {
+        let place = &mut first[bucket(side)];
+        *place -= 1;
+        sides[*place as usize] = side;
     }
     let mut out = vec![[NOTHING; 3]; faces.len()];
     for range in first.windows(2) {
         let group = &mut sides[range[0] as usize..range[1] as usize];
-        group.sort_unstable();
-        for same in group.chunk_by(|a, b| a.0 == b.0) {
-            if let [(_, p), (_, q)] = *same {
-                out[p as usize / 3][p as usize % 3] = (q / 3) as i32;
-                out[q as usize / 3][q as usize % 3] = (p / 3) as i32;
+        group.sort_unstable_by_key(|&side| ends(side));
+        for same in group.chunk_by(|&a, &b| ends(a) == ends(b)) {
+            if let [p, q] = *same {
+                let (p, q) = (p as usize, q as usize);
+                out[p / 3][p % 3] = (q / 3) as i32;
+                out[q / 3][q % 3] = (p / 3) as i32;
             }
         }
     }
@@ -129,6 +134,8 @@ mod tests {
         assert_eq!(n, [[-1, 1, -1], [0, -1, -1], [-1, -1, -1]]);
         assert_eq!(components(&n, |_, _| true), (vec![0, 0, 1], 2));
         assert_eq!(components(&n, |_, _| false).1, 3);
+        let far = [[0, 1, u32::MAX], [u32::MAX, 1, 3], [7, u32::MAX - 1, 9]];
+        assert_eq!(neighbours(&far), [[-1, 1, -1], [0, -1, -1], [-1, -1, -1]]);
     }
 
     #[test]
