@@ -276,8 +276,8 @@ class StandingConfig(Checked):
 class SurfaceConfig(Checked):
     """From the field to the mesh."""
 
-    min_component: Annotated[float, within(0, 1, "share of the faces")] = 0.005
-    """Parts with a smaller share of the faces than this, relative to the largest, are dropped."""
+    min_component: Annotated[float, within(0, 1, "share of the area")] = 0.005
+    """Parts with a smaller share of the area than this, relative to the largest, are dropped."""
     close_holes: Annotated[int, within(0, 1_000_000, "edges")] = 120
     """Holes of at most this many edges (of somewhat less than a voxel) are closed where they lie in the surface; 0 leaves them all."""
     unseen_reach: Annotated[float, within(0, 1e6, "voxels")] | None = 1.0

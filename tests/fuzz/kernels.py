@@ -118,7 +118,7 @@ def calls() -> dict[str, Arguments]:
         },
         "components": {"faces": faces},
         "close_holes": {**mesh, "most_edges": 8},
-        "decimate": {**mesh, "error": 0.1, "most_faces": 4},
+        "decimate": {**mesh, "error": 0.1, "most_faces": 4, "keep_borders": True},
         "nearest": {"points": points, "others": points[::-1].copy(), "reach": 5.0},
         "encode_png": {"rgb": rgb()},
         "nurbs_basis": {"knots": knots, "count": 4, "u": u, "order": 1},

@@ -52,16 +52,24 @@ def marching_cubes(values: NDArray[np.float32], level: float = 0.0) -> tuple[NDA
     return _core.isosurface_dense(shifted)
 
 
-def isosurface(volume: Volume | Iterable[Volume]) -> Surface:
+def isosurface(volume: Volume | Iterable[Volume], decimation: float = 0.0) -> Surface:
     """The surface of a block-sparse field in world coordinates; parts of one (`mvcore.volume.tsdf.fuse_tiles`) are joined.
 
     Vertices on a layer that two parts share are equal to the bit in both, and become one.
+
+    Parameters
+    ----------
+    decimation : voxels by which the inside of each part's surface may move to have fewer faces (`decimate`); borders stay.
     """
     points, faces, count = [], [], 0
     grid: Volume | None = None
     for part in [volume] if isinstance(volume, Volume) else volume:
         p, f = _core.isosurface_sparse(part.coords, part.values)
         grid = replace(part, coords=part.coords[:0], values=part.values[:0])
+        del part
+        if decimation:
+            wide, f = _used(*_core.decimate(p.astype(np.float64), f, decimation, keep_borders=True))
+            p = wide.astype(np.float32)
         points.append(p)
         f += np.uint32(count)
         faces.append(f)
@@ -154,12 +162,20 @@ def _used(vertices: NDArray[Any], faces: Faces) -> tuple[NDArray[Any], Faces]:
 
 
 def drop_small_parts(surface: Surface, share: float) -> Surface:
-    """Drops connected parts with fewer than ``share`` times the faces of the largest."""
+    """Drops connected parts of less than ``share`` times the area of the largest."""
     if share <= 0 or not len(surface.faces):
         return surface
     part = _core.components(surface.faces)
-    size = np.bincount(part)
+    size = np.bincount(part, _areas(surface))
     return compact(surface.vertices, surface.faces[size[part] >= share * size.max()])
+
+
+def _areas(surface: Surface) -> Float:
+    """(F,) in square world units."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    b -= a
+    c -= a
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b, c), axis=1))
 
 
 def close_holes(surface: Surface, most_edges: int) -> Surface:

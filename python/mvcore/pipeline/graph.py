@@ -169,7 +169,11 @@ def frame_tasks(
     rig = Rig(views.cameras, views.windows, views.masked, plan.box, any(plan.sources))
     used = [n for n, s in enumerate(plan.sources) if s]
     rough = {n: _matched(views, plan, n, before.prediction, config) for n in used}
-    field_ = FieldSettings(config.volume, config.carve, config.standing, config.surface.min_component, config.surface.unseen_reach)
+    surface = config.surface
+    # Parts of the field are decimated on their own by half of what the mesh may move.
+    field_ = FieldSettings(
+        config.volume, config.carve, config.standing, surface.min_component, surface.unseen_reach, surface.decimation / 2
+    )
     third_pass = bool(config.depth.surface_rounds)
     second = {n: _refined(views, plan, n, rough, config, last=not third_pass) for n in used}
     draft, draft_loose, third = None, {}, second

@@ -96,7 +96,7 @@ def memory_settings(config: Config, max_memory: int | None, pixels: int) -> tupl
         f"{max_memory / 2**20:.0f} MiB",
     )
     threads = max(1, min(local_workers(), int(0.5 * max_memory // task)))
-    volume = replace(config.volume, max_memory=min(config.volume.max_memory, int(0.4 * max_memory)))
+    volume = replace(config.volume, max_memory=min(config.volume.max_memory, int(0.25 * max_memory)))
     return replace(config, volume=volume), int(0.25 * max_memory), threads
 
 

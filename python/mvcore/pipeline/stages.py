@@ -444,6 +444,7 @@ class FieldSettings:
     standing: StandingConfig
     min_component: float
     unseen_reach: float | None
+    decimation: float
 
 
 def _field(
@@ -477,9 +478,9 @@ def _isosurface(
     report: Report,
 ) -> Surface:
     if completion is None:
-        return isosurface(_field(depths, pixels, rig, None, settings, report))
+        return isosurface(_field(depths, pixels, rig, None, settings, report), settings.decimation)
     agreeing = completion.agreeing(depths, rig.cameras)
-    return drop_cavities(isosurface(_field(agreeing, pixels, rig, completion, settings, report)))
+    return drop_cavities(isosurface(_field(agreeing, pixels, rig, completion, settings, report), settings.decimation))
 
 
 DRAFT_VOXEL = 1.4

@@ -377,7 +377,7 @@ def fuse_tiles(
     job = _Fusion.of(depths, cameras, bounds, masks, config, windows, found)
     grid = job.grid(job.voxel)
 
-    def told() -> Iterator[Volume]:
+    def made() -> Iterator[Volume]:
         parts, hints = [], None
         if masks is not None and unseen_reach is not None:
             hints = coarse.hints(job.coarse(grid), cameras, grid, unseen_reach)
@@ -387,7 +387,7 @@ def fuse_tiles(
                 yield part
         _say(grid, parts, report)
 
-    return told()
+    return made()
 
 
 def _say(grid: Volume, parts: list[tuple[int, int]], report: Report) -> None:

@@ -282,17 +282,18 @@ pub fn close_holes<'py>(
 
 /// Vertices, some moved and some without a face, and the faces that are left within an error bound.
 #[pyfunction]
-#[pyo3(signature = (vertices, faces, error, most_faces = usize::MAX))]
+#[pyo3(signature = (vertices, faces, error, most_faces = usize::MAX, keep_borders = false))]
 pub fn decimate<'py>(
     py: Python<'py>,
     vertices: PyReadonlyArray2<'py, f64>,
     faces: PyReadonlyArray2<'py, u32>,
     error: f64,
     most_faces: usize,
+    keep_borders: bool,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
     let (vertices, faces) = (rows::<3, _>(&vertices, "vertices")?, rows::<3, _>(&faces, "faces")?);
     finite(py, "vertices", vertices.as_flattened().iter().copied())?;
-    let kernel = || mvcore::decimate::decimate(mvcore::mesh::Mesh::new(vertices, faces)?, error, most_faces);
+    let kernel = || mvcore::decimate::decimate(mvcore::mesh::Mesh::new(vertices, faces)?, error, most_faces, keep_borders);
     let left = run(py, kernel)?;
     let (v, f) = (left.vertices.len(), left.faces.len());
     Ok((array(py, left.vertices.into_flattened(), [v, 3])?, array(py, left.faces.into_flattened(), [f, 3])?))

@@ -11,7 +11,7 @@
 
 use crate::error::{Result, require};
 use crate::interrupt::Interrupt;
-use crate::mesh::Mesh;
+use crate::mesh::{Mesh, NOTHING, neighbours};
 use meshopt::{SimplifyOptions, SimplifyVertex, simplify_with_update};
 use rayon::prelude::*;
 
@@ -31,13 +31,14 @@ pub struct Decimated {
 }
 
 /// Collapses edges while the surface moves by no more than `error` (world units, root mean square over the faces that meet), and then
-/// until there are no more than about `most_faces`.
-pub fn decimate(mesh: Mesh, error: f64, most_faces: usize) -> Result<Decimated> {
+/// until there are no more than about `most_faces`. With `keep_borders` the vertices at borders stay while the error decides.
+pub fn decimate(mesh: Mesh, error: f64, most_faces: usize, keep_borders: bool) -> Result<Decimated> {
     require(error.is_finite() && error >= 0.0, "error", "0 or more", error)?;
     let mut out = Decimated { vertices: mesh.vertices.to_vec(), faces: mesh.faces.to_vec() };
     if error > 0.0 {
-        let locked = out.collapse_cells(error, 0.0, |_| true);
-        out.collapse_cells(error, 0.5, |v| locked[v as usize]);
+        let kept = if keep_borders { at_border(mesh) } else { vec![false; mesh.vertices.len()] };
+        let shared = out.collapse_cells(error, 0.0, |v| !kept[v as usize]);
+        out.collapse_cells(error, 0.5, |v| shared[v as usize] && !kept[v as usize]);
     }
     if out.faces.len() > most_faces {
         Interrupt::current().poll();
@@ -46,6 +47,18 @@ pub fn decimate(mesh: Mesh, error: f64, most_faces: usize) -> Result<Decimated> 
         out.take(rest);
     }
     Ok(out)
+}
+
+/// Vertices of edges that only one face has.
+fn at_border(mesh: Mesh) -> Vec<bool> {
+    let mut out = vec![false; mesh.vertices.len()];
+    for (face, around) in mesh.faces.iter().zip(neighbours(mesh.faces)) {
+        for e in (0..3).filter(|&e| around[e] == NOTHING) {
+            out[face[e] as usize] = true;
+            out[face[(e + 1) % 3] as usize] = true;
+        }
+    }
+    out
 }
 
 impl Decimated {
@@ -187,24 +200,38 @@ mod tests {
     fn planes_lose_their_inner_vertices_and_keep_crease_and_corners() {
         let n = 400;
         let (vertices, faces) = roof(n);
-        let left = decimate(Mesh::new(&vertices, &faces).unwrap(), 0.3, usize::MAX).unwrap();
+        let left = decimate(Mesh::new(&vertices, &faces).unwrap(), 0.3, usize::MAX, false).unwrap();
         assert!(left.faces.len() < 300, "{} faces", left.faces.len());
         let whole = f64::from(n) * f64::from(n) * 2f64.sqrt();
         assert!((area(&left.vertices, &left.faces) / whole - 1.0).abs() < 1e-4);
     }
 
     #[test]
+    fn borders_are_kept_to_be_joined_later() {
+        let n = 60;
+        let (vertices, faces) = roof(n);
+        let left = decimate(Mesh::new(&vertices, &faces).unwrap(), 0.3, usize::MAX, true).unwrap();
+        assert!(left.faces.len() < faces.len() / 5);
+        let mut used = vec![false; vertices.len()];
+        left.faces.as_flattened().iter().for_each(|&v| used[v as usize] = true);
+        let end = f64::from(n);
+        for (v, p) in vertices.iter().enumerate().filter(|(_, p)| [0.0, end].contains(&p[0]) || [0.0, end].contains(&p[1])) {
+            assert!(used[v] && left.vertices[v] == *p);
+        }
+    }
+
+    #[test]
     fn a_face_count_is_kept_to_whatever_it_costs() {
         let (vertices, faces) = roof(20);
         let mesh = Mesh::new(&vertices, &faces).unwrap();
-        assert_eq!(decimate(mesh, 0.0, usize::MAX).unwrap().faces, faces);
-        let left = decimate(mesh, 0.0, 100).unwrap().faces;
+        assert_eq!(decimate(mesh, 0.0, usize::MAX, false).unwrap().faces, faces);
+        let left = decimate(mesh, 0.0, 100, false).unwrap().faces;
         assert!(left.len() <= 100 && left.len() > 20, "{} faces", left.len());
     }
 
     #[test]
     fn bad_errors_are_refused_and_nothing_stays_nothing() {
-        assert!(decimate(Mesh::new(&[], &[]).unwrap(), 1.0, 10).unwrap().faces.is_empty());
-        assert!(decimate(Mesh::new(&[], &[]).unwrap(), f64::NAN, 10).unwrap_err().to_string().starts_with("error:"));
+        assert!(decimate(Mesh::new(&[], &[]).unwrap(), 1.0, 10, true).unwrap().faces.is_empty());
+        assert!(decimate(Mesh::new(&[], &[]).unwrap(), f64::NAN, 10, true).unwrap_err().to_string().starts_with("error:"));
     }
 }
