@@ -148,7 +148,7 @@ def preflight(
     if outlook is not None:
         _check_sources(outlook, notes)
         try:
-            memory_settings(settings, max_memory, outlook.width * outlook.height)
+            memory_settings(settings, max_memory, cameras)
         except InvalidInputError as error:
             notes.error("max_memory", error)
     if outlook is not None and not remote:

@@ -86,9 +86,7 @@ def reconstruct(
     request = _request(frames, calib, masks, bounds)
     remote = executor is not None or scheduler is not None
     before = _checked(request, settings, workdir=workdir, max_memory=max_memory, remote=remote)
-    limit = settings.depth.max_image_size
-    pixels = max(int(c.width * c.height * min(1.0, limit / max(c.width, c.height)) ** 2) for c in request.calib)
-    settings, budget, threads = memory_settings(settings, max_memory, pixels)
+    settings, budget, threads = memory_settings(settings, max_memory, list(request.calib))
     with open_session(workdir, executor, scheduler, budget, threads) as (place, runner):
         return _reconstructed(Run(runner, settings, track or no_track), request, place, before)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from ..config import Config
 from ..errors import require
+from ..geometry.cameras import Camera
 from ..types import DepthMap
 from .cache import Cache
 from .cluster import Cluster
@@ -72,13 +73,15 @@ def stored_depths(workdir: Workdir, runner: Runner, tasks: Sequence[Task[DepthMa
     return StoredDepths(workdir, runner.cache, keys)
 
 
-def memory_settings(config: Config, max_memory: int | None, pixels: int) -> tuple[Config, int, int]:
+def memory_settings(
+    config: Config, max_memory: int | None, cameras: Sequence[Camera]
+) -> tuple[Config, int, int]:
     """How ``max_memory`` is divided: the settings, bytes of results kept in memory, and local tasks at a time.
 
     Parameters
     ----------
     max_memory : bytes that the process may take beyond what it takes idle; None for no bound.
-    pixels : of the largest view as it is matched.
+    cameras : as calibrated; the largest view counts, reduced as it is matched.
 
     Raises
     ------
@@ -87,6 +90,9 @@ def memory_settings(config: Config, max_memory: int | None, pixels: int) -> tupl
     """
     if max_memory is None:
         return config, CACHE, local_workers()
+    limit = config.depth.max_image_size
+    sides = [(c.width, c.height, min(1.0, limit / max(c.width, c.height))) for c in cameras]
+    pixels = max(int(width * height * scale**2) for width, height, scale in sides)
     task = TASK_BYTES * pixels + TASK_LEAST
     least = 2 * task
     require(

@@ -126,8 +126,8 @@ class ClipRun:
 
     def frames(self) -> Iterator[Reconstruction]:
         """The reconstructions; the model of a rigid target after the last one."""
-        pixels = max(c.width * c.height for c in self.job.clips.calib)
-        config, budget, threads = memory_settings(self.job.config, self.max_memory, pixels)
+        cameras = list(self.job.clips.calib)
+        config, budget, threads = memory_settings(self.job.config, self.max_memory, cameras)
         self.job = replace(self.job, config=config)
         with open_session(self.workdir, self.executor, self.scheduler, budget, threads) as (place, runner):
             yield from self._frames(runner, place)
