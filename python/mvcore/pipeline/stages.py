@@ -478,9 +478,11 @@ def _isosurface(
     report: Report,
 ) -> Surface:
     if completion is None:
-        return isosurface(_field(depths, pixels, rig, None, settings, report), settings.decimation)
+        # With masks what no camera sees is dropped afterwards, face by face: they stay small until then.
+        decimation = 0.0 if rig.masked else settings.decimation
+        return isosurface(_field(depths, pixels, rig, None, settings, report), decimation)
     agreeing = completion.agreeing(depths, rig.cameras)
-    return drop_cavities(isosurface(_field(agreeing, pixels, rig, completion, settings, report), settings.decimation))
+    return drop_cavities(isosurface(_field(agreeing, pixels, rig, completion, settings, report)))
 
 
 DRAFT_VOXEL = 1.4
