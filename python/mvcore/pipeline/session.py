@@ -73,9 +73,7 @@ def stored_depths(workdir: Workdir, runner: Runner, tasks: Sequence[Task[DepthMa
     return StoredDepths(workdir, runner.cache, keys)
 
 
-def memory_settings(
-    config: Config, max_memory: int | None, cameras: Sequence[Camera]
-) -> tuple[Config, int, int]:
+def memory_settings(config: Config, max_memory: int | None, cameras: Sequence[Camera]) -> tuple[Config, int, int]:
     """How ``max_memory`` is divided: the settings, bytes of results kept in memory, and local tasks at a time.
 
     Parameters

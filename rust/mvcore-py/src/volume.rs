@@ -293,7 +293,8 @@ pub fn decimate<'py>(
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
     let (vertices, faces) = (rows::<3, _>(&vertices, "vertices")?, rows::<3, _>(&faces, "faces")?);
     finite(py, "vertices", vertices.as_flattened().iter().copied())?;
-    let kernel = || mvcore::decimate::decimate(mvcore::mesh::Mesh::new(vertices, faces)?, error, most_faces, keep_borders);
+    let kernel =
+        || mvcore::decimate::decimate(mvcore::mesh::Mesh::new(vertices, faces)?, error, most_faces, keep_borders);
     let left = run(py, kernel)?;
     let (v, f) = (left.vertices.len(), left.faces.len());
     Ok((array(py, left.vertices.into_flattened(), [v, 3])?, array(py, left.faces.into_flattened(), [f, 3])?))

@@ -215,7 +215,9 @@ mod tests {
         let mut used = vec![false; vertices.len()];
         left.faces.as_flattened().iter().for_each(|&v| used[v as usize] = true);
         let end = f64::from(n);
-        for (v, p) in vertices.iter().enumerate().filter(|(_, p)| [0.0, end].contains(&p[0]) || [0.0, end].contains(&p[1])) {
+        for (v, p) in
+            vertices.iter().enumerate().filter(|(_, p)| [0.0, end].contains(&p[0]) || [0.0, end].contains(&p[1]))
+        {
             assert!(used[v] && left.vertices[v] == *p);
         }
     }
@@ -232,6 +234,8 @@ mod tests {
     #[test]
     fn bad_errors_are_refused_and_nothing_stays_nothing() {
         assert!(decimate(Mesh::new(&[], &[]).unwrap(), 1.0, 10, true).unwrap().faces.is_empty());
-        assert!(decimate(Mesh::new(&[], &[]).unwrap(), f64::NAN, 10, true).unwrap_err().to_string().starts_with("error:"));
+        assert!(
+            decimate(Mesh::new(&[], &[]).unwrap(), f64::NAN, 10, true).unwrap_err().to_string().starts_with("error:")
+        );
     }
 }
