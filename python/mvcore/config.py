@@ -200,7 +200,7 @@ class VolumeConfig(Checked):
     """With masks, elsewhere: where depth is known here and not there, the solid inside of the hull would leave crumbs."""
     hull_tolerance: Annotated[float, within(0, 1, "share of the views")] = 0.04
     """Share of the silhouettes that may disagree: one wrong mask among 25 does no harm; with fewer views each is needed."""
-    max_memory: Annotated[int, within(1, 1 << 50, "bytes")] = 256 << 20
+    max_memory: Annotated[int, within(1, 1 << 50, "bytes")] = 4 << 30
     """Bytes of the volume; the voxels grow until it fits, and the report says so."""
 
 

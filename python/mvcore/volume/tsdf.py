@@ -349,6 +349,10 @@ def fuse(
     return volume
 
 
+TILE = 256 << 20
+"""Bytes of a tile at most, and of the maps that it reads: larger ones save little time."""
+
+
 def fuse_tiles(
     depths: Sequence[DepthMap | None],
     cameras: Sequence[Camera],
@@ -360,8 +364,8 @@ def fuse_tiles(
     found: Sequence[NDArray[np.uint8]] | None = None,
     unseen_reach: float | None = None,
 ) -> Iterator[Volume]:
-    """The same in parts of at most ``config.max_memory`` bytes, one where it fits: none is in memory but the one handed out. Blocks deep
-    inside the masks' hull are left out.
+    """The same in parts of at most ``config.max_memory`` or `TILE` bytes, one where it fits. None is in
+    memory but the one handed out. Blocks deep inside the masks' hull are left out.
 
     Neighbours share a layer of samples, equal to the bit, and each cell between samples is in one part alone:
     `mvcore.mesh.surface.isosurface` joins their surfaces to that of the whole. Parameters and errors as of `fuse`, and
@@ -374,6 +378,7 @@ def fuse_tiles(
         is open there. None makes all of it.
     """
     config, report = config or VolumeConfig(), report or Report()
+    config = replace(config, max_memory=min(config.max_memory, TILE))
     job = _Fusion.of(depths, cameras, bounds, masks, config, windows, found)
     grid = job.grid(job.voxel)
 
